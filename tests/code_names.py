@@ -122,16 +122,16 @@ def is_defined(name: str) -> bool:
     A name that begins with a package of the program is resolved in its module. `test_of_` with an ellipsis stands
     for the names that begin so, and a test may be named without `test_`.
     """
-    words = collect_words()
+    known_words = collect_words()
     name = name.removesuffix("()").lstrip(".")
     if name.endswith("..."):
-        return any(word.startswith(name.removesuffix("...")) for word in words)
+        return any(word.startswith(name.removesuffix("...")) for word in known_words)
     package, *rest = name.split(".")
     if len(rest) > 1 and (house.ROOT / "trilat_net" / package).is_dir():
         module, *rest = [
             part for part in rest if not (house.ROOT / "trilat_net" / package / part).is_dir()
         ]
         return set(rest) <= _find_modules().get(module, set())
-    return name in words or all(
-        part in words or f"test_{part}" in words for part in (package, *rest)
+    return name in known_words or all(
+        part in known_words or f"test_{part}" in known_words for part in (package, *rest)
     )

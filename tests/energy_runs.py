@@ -138,7 +138,7 @@ def drawn(law: str, seed: int) -> Scenario:
             for at_s, name in times
         ]
         more["timeline"] = [
-            {**one, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for one in changes
+            {**change, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for change in changes
         ]
         more["dominance"] = {name: _draw_shares(rng, name) for name in names}
     control, link = {"law": law, **keys[law]}, links[rng.integers(4)]

@@ -149,9 +149,9 @@ def read_keys(command: str) -> list[str]:
 
 def is_documented(command: str, value: Any) -> bool:
     """True if the table has every key of a result, as it is, or with more below it."""
-    known = read_keys(command)
+    keys = read_keys(command)
     return all(
-        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in known)
+        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in keys)
         for path in gather([value])
     )
 

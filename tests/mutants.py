@@ -125,9 +125,12 @@ class _Places(ast.NodeVisitor):
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
         lines = text.splitlines()
         self._tokens = [
-            ((one.start[0], len(lines[one.start[0] - 1][: one.start[1]].encode())), one.string)
-            for one in tokens
-            if one.string.strip() and one.type != tokenize.COMMENT
+            (
+                (token.start[0], len(lines[token.start[0] - 1][: token.start[1]].encode())),
+                token.string,
+            )
+            for token in tokens
+            if token.string.strip() and token.type != tokenize.COMMENT
         ]
         self._words = dict(self._tokens)
         self.visit(house.tree(path))
@@ -144,7 +147,7 @@ class _Places(ast.NodeVisitor):
             (after.lineno, after.col_offset),
         )
         low, high = (bisect_left(self._tokens, (place, "")) for place in (first, last))
-        words = [one for one in self._tokens[low:high] if one[1] not in ("(", ")")]
+        words = [token for token in self._tokens[low:high] if token[1] not in ("(", ")")]
         if len(words) == 1 and words[0][1] in OTHERS:  # `is not` and `not in` are two
             self._add(*words[0], OTHERS[words[0][1]])
 
@@ -379,15 +382,17 @@ def main() -> int:
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, help="processes that test"
     )
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     print("| change | found by | s |\n|---|---|---|", flush=True)
     drawn = [
-        one for one in draw_mutants(given.seed, given.count) if re.search(given.only, str(one))
+        one
+        for one in draw_mutants(arguments.seed, arguments.count)
+        if re.search(arguments.only, str(one))
     ]
     survivors = 0
     for mutant in drawn:
         begun_s = time.monotonic()
-        found = judge_mutant(mutant, given.workers)
+        found = judge_mutant(mutant, arguments.workers)
         survivors += not found
         print(
             f"| {mutant} | {found or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |",

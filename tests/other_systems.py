@@ -70,7 +70,7 @@ def _list_names(body: list[ast.stmt], platform: str) -> Iterator[tuple[str, bool
             yield node.name, True
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            yield from ((one.id, True) for one in targets if isinstance(one, ast.Name))
+            yield from ((target.id, True) for target in targets if isinstance(target, ast.Name))
         elif isinstance(node, ast.ImportFrom):
             yield from ((alias.asname or alias.name, False) for alias in node.names)
 

@@ -74,10 +74,10 @@ def main() -> int:
         ).returncode
         rows = [line.partition("\t") for line in times.read_text(encoding="utf-8").splitlines()]
     if code == 0:
-        left = choose_long_tests({name: float(seconds) for seconds, _tab, name in rows})
-        LONG_TESTS.write_text("".join(f"{name}\n" for name in left), encoding="utf-8")
+        long_tests = choose_long_tests({name: float(seconds) for seconds, _tab, name in rows})
+        LONG_TESTS.write_text("".join(f"{name}\n" for name in long_tests), encoding="utf-8")
         print(
-            f"{len(left)} of {len(rows)} tests are left to make test-long: {LONG_TESTS.relative_to(ROOT)}"
+            f"{len(long_tests)} of {len(rows)} tests are left to make test-long: {LONG_TESTS.relative_to(ROOT)}"
         )
     return code
 

@@ -48,10 +48,10 @@ def test_every_exception_names_an_existing_test() -> None:
 
 def test_every_block_runs_or_has_a_reason() -> None:
     runs = {"sh": COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
-    known = [block for block in BLOCKS if block.language]
-    assert len(known) > 60
+    blocks = [block for block in BLOCKS if block.language]
+    assert len(blocks) > 60
     assert not [
-        b.name for b in known if b.page not in runs[b.language] and not find_exception(b)
+        b.name for b in blocks if b.page not in runs[b.language] and not find_exception(b)
     ]
 
 
@@ -66,15 +66,15 @@ def test_commands_parse_as_written(page: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_in_sentences_have_their_options(page: str) -> None:
     for text in re.findall(r"`(trilat [^`]*)`", (ROOT / page).read_text(encoding="utf-8")):
-        words = re.findall(r"[^\s\[\]|,()]+", text)
-        (name, *_) = [w for w in (" ".join(words[:n]) for n in (3, 2, 1)) if w in OPTIONS]
+        matches = re.findall(r"[^\s\[\]|,()]+", text)
+        (name, *_) = [w for w in (" ".join(matches[:n]) for n in (3, 2, 1)) if w in OPTIONS]
         below = [one for known, one in OPTIONS.items() if known.startswith(name)]
         known = {option for one in below for option in one} | {
             "--help",
             "--version",
             "--install-completion",
         }
-        given = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        given = {word.partition("=")[0] for word in matches if re.match(r"--?[a-z]", word)}
         assert not given - known, text
 
 
@@ -307,8 +307,8 @@ AT_HAND = {
 def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> str:
     """Runs the code of a page in a folder, in one namespace; returns its output."""
     space: dict[str, Any] = {"__name__": "page"} if names is None else names
-    printed = StringIO()
-    with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
+    stream = StringIO()
+    with redirect_stdout(stream), pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for code in (
             AT_HAND.get(page, ""),
@@ -319,7 +319,7 @@ def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> 
             ),
         ):
             exec(compile(code, page, "exec"), space)
-    return printed.getvalue()
+    return stream.getvalue()
 
 
 def check_linear(printed: str, _: dict[str, Any]) -> None:
@@ -370,11 +370,11 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 def test_page_code_finds_its_stated_results(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
-    printed = run_python(page, tmp_path, names)
+    output = run_python(page, tmp_path, names)
     if page in CHECKS:
-        CHECKS[page](printed, names)
+        CHECKS[page](output, names)
     else:
-        assert printed.splitlines() == list_shown(page)
+        assert output.splitlines() == list_shown(page)
 
 
 def list_shown(page: str) -> list[str]:

@@ -166,7 +166,9 @@ def test_every_written_text_states_its_line_ends() -> None:
     for path in house.files():
         for call in (node for node in ast.walk(house.tree(path)) if isinstance(node, ast.Call)):
             name = getattr(call.func, "attr", getattr(call.func, "id", ""))
-            modes = [one.value for one in call.args if isinstance(one, ast.Constant)]
+            modes = [
+                argument.value for argument in call.args if isinstance(argument, ast.Constant)
+            ]
             writes = name == "write_text" or (
                 name == "open" and {"w", "a", "x", "r+", "w+"} & {*modes}
             )

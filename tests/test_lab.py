@@ -48,7 +48,7 @@ def test_no_command_reveals_results_before_predictions() -> None:
     """`test` prints the limits that a scenario expects, and `show` and `list` print its text,
     which contains them.
     """
-    named = {tuple(words[1:3]) for words in COMMANDS}
+    named = {tuple(command[1:3]) for command in COMMANDS}
     assert not {words for words in named if words[0] == "test"}
     assert not {("scenario", "show"), ("scenario", "list")} & named
 
@@ -78,10 +78,10 @@ ANSWERS = (Path(__file__).parents[1] / "docs" / "tutorials" / "lab-answers.md").
 def read_groups() -> list[list[float]]:
     """Runs the lecturer's code: per group its number, K, T in ms, a, 1 - a, and three margins."""
     (code,) = re.findall(r"^```python\n(.*?)^```", ANSWERS, re.S | re.M)
-    printed = StringIO()
-    with redirect_stdout(printed):
+    stream = StringIO()
+    with redirect_stdout(stream):
         exec(code, {})
-    return [list(map(float, line.split())) for line in printed.getvalue().splitlines()[1:]]
+    return [list(map(float, line.split())) for line in stream.getvalue().splitlines()[1:]]
 
 
 def list_dominance(a: float) -> dict[str, dict[str, float]]:

@@ -12,10 +12,10 @@ from .mutants import draw_mutants
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_mutant_is_one_token_of_code(seed: int) -> None:
-    drawn = draw_mutants(seed, 40)
-    assert drawn == draw_mutants(seed, 40)
-    assert len(set(drawn)) == 40
-    for mutant in drawn:
+    mutants = draw_mutants(seed, 40)
+    assert mutants == draw_mutants(seed, 40)
+    assert len(set(mutants)) == 40
+    for mutant in mutants:
         before, after = (
             [
                 one.string
@@ -28,4 +28,4 @@ def test_a_mutant_is_one_token_of_code(seed: int) -> None:
         assert before[at] == mutant.was
         assert [*before[:at], *([mutant.now] if mutant.now else []), *before[at + 1 :]] == after
         ast.parse(mutant.apply())
-    assert {house.room(mutant.path) for mutant in drawn} == {"core", "log", "analysis"}
+    assert {house.room(mutant.path) for mutant in mutants} == {"core", "log", "analysis"}

@@ -166,9 +166,14 @@ def known(delay_ms: float) -> float:
 
 
 def lacking() -> Numbers:
-    made = ports("p_d_margin_two", control__d=1.96).velocity
-    (band,) = made.minima.below
-    return (*band[:2], made.minima.least, made.minima.least_hz, made.lacking_nm_s_rad)
+    velocity = ports("p_d_margin_two", control__d=1.96).velocity
+    (band,) = velocity.minima.below
+    return (
+        *band[:2],
+        velocity.minima.least,
+        velocity.minima.least_hz,
+        velocity.lacking_nm_s_rad,
+    )
 
 
 def reflecting(delay_ms: float, d: float) -> PortAnalysis:
@@ -187,9 +192,9 @@ def stable_with_any(delay_ms: float, d: float) -> Numbers:
 
 def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
     scenario = load_scenario(name, keys(changes))
-    made = FusedRun(scenario)
-    made.advance_to(duration_s or scenario.duration_s)
-    return made
+    fused_run = FusedRun(scenario)
+    fused_run.advance_to(duration_s or scenario.duration_s)
+    return fused_run
 
 
 def rms_of_free(delay_ms: float) -> float:
@@ -513,9 +518,9 @@ ROWS = [
 def numbers(words: str, text: str) -> list[str]:
     """Returns the numbers in the single place of a text that has these words."""
     pattern = NUMBER.join(map(re.escape, words.split("{}")))
-    found = re.findall(pattern, " ".join(text.split()))
-    assert len(found) == 1, f"{len(found)} places"
-    return [found[0]] if isinstance(found[0], str) else list(found[0])
+    matches = re.findall(pattern, " ".join(text.split()))
+    assert len(matches) == 1, f"{len(matches)} places"
+    return [matches[0]] if isinstance(matches[0], str) else list(matches[0])
 
 
 def check(page: str, words: str, made: Numbers | str) -> None:

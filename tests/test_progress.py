@@ -39,12 +39,12 @@ def run_tests(folder: Path, *options: str) -> str:
 
 @pytest.mark.parametrize("options", [[], pytest.param(["-n", "2"], marks=pytest.mark.long)])
 def test_a_run_prints_lines_with_an_estimate(options: list[str], tmp_path: Path) -> None:
-    printed = run_tests(tmp_path, *options)
-    assert "numbers: 6 tests\n" in printed
-    assert re.search(r"numbers: \d+ %, 2 of 6 tests, \d+ s, about \d+ s left", printed)
-    assert re.search(r"numbers: 6 tests in \d+ s", printed)
-    assert "1 failed, 5 passed" in printed
-    assert "....F" not in printed  # no letters of what passed
+    output = run_tests(tmp_path, *options)
+    assert "numbers: 6 tests\n" in output
+    assert re.search(r"numbers: \d+ %, 2 of 6 tests, \d+ s, about \d+ s left", output)
+    assert re.search(r"numbers: 6 tests in \d+ s", output)
+    assert "1 failed, 5 passed" in output
+    assert "....F" not in output  # no letters of what passed
     assert re.search(r"numbers: 6 tests, about \d+ s\n", run_tests(tmp_path, *options))
 
 

@@ -58,13 +58,15 @@ def test_the_page_lists_nearly_every_command() -> None:
 def test_options_of_these_commands_exist() -> None:
     options = all_options()
     for command in list_all():
-        words = shlex.split(command)
-        if words[0] != "trilat":
+        arguments = shlex.split(command)
+        if arguments[0] != "trilat":
             continue
-        name = max((one for one in options if " ".join(words).startswith(one)), key=len)
+        name = max(
+            (option for option in options if " ".join(arguments).startswith(option)), key=len
+        )
         if name == "trilat set":
             continue  # the options of its commands follow their words
-        unknown = {word.partition("=")[0] for word in words if word.startswith("-")} - {
+        unknown = {word.partition("=")[0] for word in arguments if word.startswith("-")} - {
             *options[name]
         }
         assert not {word for word in unknown if not word.startswith("--no-")}, command

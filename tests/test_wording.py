@@ -81,7 +81,7 @@ def find_bare_plurals(path: Path) -> Iterator[str]:
 
 
 def test_no_text_counts_by_a_bare_plural() -> None:
-    found = [place for path in house.files() for place in find_bare_plurals(path)]
+    found = [bare_plural for path in house.files() for bare_plural in find_bare_plurals(path)]
     assert not found, "\n".join(["use count_nouns of trilat_net/errors.py:", *found])
 
 

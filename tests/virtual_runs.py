@@ -77,11 +77,11 @@ def sampled(scenario: Scenario, times_s: Array | tuple[float, ...]) -> Array:
     """Returns the last records before some times, shape (N, K, 17), of a compiled run: quick
     for few times.
     """
-    made = FusedRun(scenario)
+    fused_run = FusedRun(scenario)
     rows = []
     for t_s in times_s:
-        made.advance_to(float(t_s))
-        rows.append(made.records)
+        fused_run.advance_to(float(t_s))
+        rows.append(fused_run.records)
     return np.stack(rows, axis=1)
 
 

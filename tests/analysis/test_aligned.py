@@ -42,14 +42,14 @@ def test_tracks_end_with_the_last_common_time() -> None:
             and (state.site != "d" or state.t_ns < 12e8)
         ),
     )
-    found = align_records(log, common=True)
-    assert {site: track.t_s[0] for site, track in found.items()} == {
+    aligned_records = align_records(log, common=True)
+    assert {site: track.t_s[0] for site, track in aligned_records.items()} == {
         "a": 0.5,
         "b": 0.0,
         "c": 0.0,
         "d": 0.0,
     }
-    assert all(1.2 - 0.03 < track.t_s[-1] < 1.2 for track in found.values())
+    assert all(1.2 - 0.03 < track.t_s[-1] < 1.2 for track in aligned_records.values())
     assert (
         align_records(
             logs.rewritten(log, lambda state: state.site != "a" or state.t_ns > 13e8),

@@ -34,10 +34,12 @@ def chain_of(name: str, **drive: float) -> ChainArmRows:
     """Returns a reference's chain with gravity along its z axis."""
     chain = REFERENCES[name].chain
     joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
-        for one in chain.joints
+        ChainJoint(
+            joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
+        )
+        for joint in chain.joints
     )
-    theta = np.concatenate([one.inertia for one in chain.joints])
+    theta = np.concatenate([joint.inertia for joint in chain.joints])
     return ChainArmRows(theta, ChainSetup(joints, (0.0, 0.0, -9.81), chain.tip_origin_m))
 
 
@@ -98,12 +100,10 @@ def test_friction_and_stops_equal_the_cores() -> None:
 
 
 def test_the_planar_arm_equals_its_chain() -> None:
-    written = Arm(
-        l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25
-    )
-    model = build_arm(written, Task(), {}, chains=True)
+    arm = Arm(l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25)
+    model = build_arm(arm, Task(), {}, chains=True)
     assert model.chain is not None
-    theta = build_arm(written, Task(), {}, chains=False).theta
+    theta = build_arm(arm, Task(), {}, chains=False).theta
     plane = PlanarArmRows(theta, 9.81, (0.8, 0.6))
     chain = ChainArmRows(model.theta, model.chain)
     q, qd, v, a = drawn(2)

@@ -32,25 +32,25 @@ ramps = st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0))
 def test_shares_equal_the_cores(drawn: list[tuple[int, int, float]]) -> None:
     tick_ns = 10**9 // RATE_HZ
     changes = [DominanceRamp(a * tick_ns, (a + n) * tick_ns, (x, 1.0 - x)) for a, n, x in drawn]
-    found = evaluate_ramps(
+    shares = evaluate_ramps(
         np.array([0.5, 0.5]), changes, np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
     )
     rows = [[0.0, 0.0, 0.5, 0.5], *([r.start_ns, r.end_ns, *r.alpha] for r in sorted(changes))]
     links = np.zeros(2, link_dtype(2))
     for k in range(100):
         apply_ramps(k * tick_ns, len(rows), np.array(rows, dtype=float), links)
-        assert found.alpha[k] == pytest.approx(links["alpha"], abs=1e-9)
-        assert found.rate[k] == pytest.approx(links["alpha_rate"], abs=1e-6)
+        assert shares.alpha[k] == pytest.approx(links["alpha"], abs=1e-9)
+        assert shares.rate[k] == pytest.approx(links["alpha_rate"], abs=1e-6)
 
 
 def test_shares_before_a_sudden_change_are_kept() -> None:
     step = DominanceRamp(10**9, 10**9, (1.0, 0.0))
-    found = evaluate_ramps(
+    shares = evaluate_ramps(
         np.array([0.5, 0.5]), [step], np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
     )
-    assert found.before[49].tolist() == [0.5, 0.5]
-    assert found.alpha[50].tolist() == [1.0, 0.0]
-    assert not found.constant
+    assert shares.before[49].tolist() == [0.5, 0.5]
+    assert shares.alpha[50].tolist() == [1.0, 0.0]
+    assert not shares.constant
     assert evaluate_ramps(np.array([0.5, 0.5]), [], np.arange(9.0), 1.0).constant
 
 
@@ -116,11 +116,13 @@ def test_pi_is_the_eigenvector_that_numpy_finds(n: int, seed: int) -> None:
 def test_scaled_kd_cancels_forwarded_motion(scales: list[float]) -> None:
     """sum_i beta_i ( |x_i|^2_Kd_i - sum_j alpha_ij |x_j|^2_Kd_i ) = 0 for all x, Eq. (20)."""
     Kd = np.outer(scales, [3.0, 0.4])
-    found = compute_lyapunov_weights(THREE, Kd)
+    weights = compute_lyapunov_weights(THREE, Kd)
     norms = np.random.default_rng(1).random((3, 2))
     passed = [Kd[i] @ (norms[i] - THREE[i] @ norms) for i in range(3)]
-    assert found.beta @ passed == pytest.approx(0.0, abs=1e-9 * max(scales) * found.beta.max())
-    assert found.beta.sum() == pytest.approx(3.0)
+    assert weights.beta @ passed == pytest.approx(
+        0.0, abs=1e-9 * max(scales) * weights.beta.max()
+    )
+    assert weights.beta.sum() == pytest.approx(3.0)
 
 
 def test_equal_shares_and_kd_give_the_papers_ones() -> None:
@@ -136,9 +138,9 @@ def test_kd_of_different_shapes_have_no_scalar() -> None:
 
 
 def test_a_site_that_nobody_follows_has_no_weight() -> None:
-    found = compute_lyapunov_weights(EXPERT, np.ones((3, 2)))
-    assert found.groups == ((0, 2),)
-    assert found.beta == pytest.approx([1.5, 0.0, 1.5])
+    weights = compute_lyapunov_weights(EXPERT, np.ones((3, 2)))
+    assert weights.groups == ((0, 2),)
+    assert weights.beta == pytest.approx([1.5, 0.0, 1.5])
 
 
 def test_two_groups_that_follow_nobody_outside_are_named() -> None:

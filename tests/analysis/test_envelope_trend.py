@@ -43,9 +43,9 @@ def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.
 @settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
 def test_exponential_growth_has_its_rate(rate: float, omega: float, phase: float) -> None:
-    found = fit_envelope(T_S, oscillation(rate, omega, phase))
-    assert found.trend is EnvelopeTrend.GROWS
-    assert found.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
+    envelope_fit = fit_envelope(T_S, oscillation(rate, omega, phase))
+    assert envelope_fit.trend is EnvelopeTrend.GROWS
+    assert envelope_fit.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
 
 
 @settings(max_examples=40)
@@ -73,11 +73,13 @@ def test_the_trend_is_independent_of_units(
     rate: float, omega: float, phase: float, scale: float
 ) -> None:
     error = np.maximum(oscillation(rate, omega, phase), 1e-3)
-    found = fit_envelope(T_S, error)
+    envelope_fit = fit_envelope(T_S, error)
     larger, slower = fit_envelope(T_S, scale * error), fit_envelope(60.0 * T_S, error)
-    assert larger.trend is slower.trend is found.trend
-    assert larger.rate_per_s == pytest.approx(found.rate_per_s, rel=1e-6, abs=1e-9)
-    assert slower.rate_per_s == pytest.approx(found.rate_per_s / 60.0, rel=1e-6, abs=1e-9)
+    assert larger.trend is slower.trend is envelope_fit.trend
+    assert larger.rate_per_s == pytest.approx(envelope_fit.rate_per_s, rel=1e-6, abs=1e-9)
+    assert slower.rate_per_s == pytest.approx(
+        envelope_fit.rate_per_s / 60.0, rel=1e-6, abs=1e-9
+    )
 
 
 @settings(max_examples=40)
@@ -148,7 +150,7 @@ def test_stationary_noise_is_hardly_ever_growth() -> None:
 
 @pytest.mark.parametrize("points", [0, 1, 2, 15, 30])
 def test_a_short_run_is_undecided(points: int) -> None:
-    found = fit_envelope(T_S[:points], np.exp(T_S[:points]))
-    assert found.trend is EnvelopeTrend.UNDECIDED
-    assert math.isnan(found.rate_per_s)
-    assert "record longer" in found.trend
+    envelope_fit = fit_envelope(T_S[:points], np.exp(T_S[:points]))
+    assert envelope_fit.trend is EnvelopeTrend.UNDECIDED
+    assert math.isnan(envelope_fit.rate_per_s)
+    assert "record longer" in envelope_fit.trend

@@ -86,16 +86,20 @@ def test_lost_and_doubled_samples_are_counted():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
     run = logs.driven(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
-    found = uses(run.log)
-    lossy = found["m2->m1"]
+    link_uses = uses(run.log)
+    lossy = link_uses["m2->m1"]
     assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
     assert lossy.loss == 14 / 199
     assert lossy.burst == 14 / 3
     assert lossy.silence_ms == 55.0  # ten samples of 5 ms, and the one that came again
     assert not lossy.plain
-    assert found["m2->s"].counts.duplicate == 2
+    assert link_uses["m2->s"].counts.duplicate == 2
     assert counted(run, "m2->s").duplicate == 2
-    assert (found["s->m1"].counts.missing, found["s->m1"].burst, found["s->m1"].loss) == (
+    assert (
+        link_uses["s->m1"].counts.missing,
+        link_uses["s->m1"].burst,
+        link_uses["s->m1"].loss,
+    ) == (
         0,
         None,
         0.0,
@@ -106,13 +110,13 @@ def test_samples_of_missing_records_have_no_fate():
     log = logs.rewritten(
         logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
     )
-    found = uses(log)
+    link_uses = uses(log)
     for link in ("m1->m2", "s->m2"):
-        counts = found[link].counts
+        counts = link_uses[link].counts
         assert (counts.missing, counts.lost, counts.late) == (0, 0, 0)
         assert counts.judged == counts.arrived == 399 - 50
     # its samples came, though its own records are gone
-    assert found["m2->s"].counts.missing == 0
+    assert link_uses["m2->s"].counts.missing == 0
 
 
 def test_a_link_cut_until_the_end_loses_everything():
@@ -140,9 +144,9 @@ def test_only_out_of_range_stamps_are_refused():
             rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx,
         )
 
-    found = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
-    assert [use.counts.refused for use in found.values()] == [1] * 6
-    assert [use.counts.sent for use in found.values()] == [400] * 6
+    link_uses = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
+    assert [use.counts.refused for use in link_uses.values()] == [1] * 6
+    assert [use.counts.sent for use in link_uses.values()] == [400] * 6
 
 
 def test_false_tick_numbers_cost_no_memory():

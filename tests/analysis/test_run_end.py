@@ -75,9 +75,9 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
     ],
 )
 def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None:
-    found = classify_log_end(moving(e, qd))
-    assert found.behaviour is motion
-    assert says in found.text
+    run_end = classify_log_end(moving(e, qd))
+    assert run_end.behaviour is motion
+    assert says in run_end.text
 
 
 @pytest.mark.parametrize(
@@ -121,11 +121,11 @@ def test_wall_hammering_shows_only_in_longer_records() -> None:
 
 
 def test_a_site_without_records_leaves_it_undecided() -> None:
-    found = classify_log_end(
+    run_end = classify_log_end(
         logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
     )
-    assert found.behaviour is EndBehaviour.UNDECIDED
-    assert found.text == "undecided: no record of s"
+    assert run_end.behaviour is EndBehaviour.UNDECIDED
+    assert run_end.text == "undecided: no record of s"
 
 
 def test_only_times_recorded_by_all_sites_count() -> None:
@@ -136,10 +136,10 @@ def test_only_times_recorded_by_all_sites_count() -> None:
 
 
 def test_a_late_jump_is_undecided() -> None:
-    found = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
-    assert found.behaviour is EndBehaviour.UNDECIDED
-    assert found.stability is Stability.OPEN
-    assert "record longer" in found.text
+    run_end = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
+    assert run_end.behaviour is EndBehaviour.UNDECIDED
+    assert run_end.stability is Stability.OPEN
+    assert "record longer" in run_end.text
 
 
 def test_short_runs_are_undecided_and_stopped_ones_diverged() -> None:
@@ -164,9 +164,9 @@ def test_a_decaying_joint_hides_no_growing_one() -> None:
         wide = swing(-0.3)(t_s)
         return logs.replaced(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
 
-    found = classify_log_end(logs.rewritten(still(), change=changed))
-    assert (found.behaviour, found.where) == (EndBehaviour.GROWS, "s joint 2")
-    assert found.stability is Stability.NOT_STABLE
+    run_end = classify_log_end(logs.rewritten(still(), change=changed))
+    assert (run_end.behaviour, run_end.where) == (EndBehaviour.GROWS, "s joint 2")
+    assert run_end.stability is Stability.NOT_STABLE
 
 
 @pytest.mark.parametrize(
@@ -187,9 +187,9 @@ def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stabilit
         x = swing(0.2)(state.t_ns * 1e-9)
         return logs.replaced(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
 
-    found = classify_log_end(logs.rewritten(log, change=changed))
-    assert found.behaviour is EndBehaviour.GROWS
-    assert found.stability is stability
+    run_end = classify_log_end(logs.rewritten(log, change=changed))
+    assert run_end.behaviour is EndBehaviour.GROWS
+    assert run_end.stability is stability
 
 
 @pytest.mark.parametrize(
@@ -214,9 +214,9 @@ def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, say
             state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0]
         )
 
-    found = classify_log_end(logs.rewritten(still(), change=changed))
-    assert found.stability is stability
-    assert says in found.text
+    run_end = classify_log_end(logs.rewritten(still(), change=changed))
+    assert run_end.stability is stability
+    assert says in run_end.text
 
 
 @pytest.mark.parametrize(
@@ -225,9 +225,9 @@ def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, say
 )
 def test_hanging_or_thrown_arms_are_not_stable(pose: list[float], says: str) -> None:
     change = lambda s: logs.replaced(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
-    found = classify_log_end(logs.rewritten(still(), change=change))
-    assert found.stability is Stability.OPEN
-    assert says in found.text
+    run_end = classify_log_end(logs.rewritten(still(), change=change))
+    assert run_end.stability is Stability.OPEN
+    assert says in run_end.text
 
 
 @pytest.mark.parametrize(
@@ -298,6 +298,6 @@ def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehavi
 def test_a_late_change_needs_a_longer_record(at_s: float, stability: Stability) -> None:
     later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
-    found = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
-    assert found.stability is stability
-    assert ("the loop changes until 39 s" in found.text) is (stability is Stability.OPEN)
+    run_end = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
+    assert run_end.stability is stability
+    assert ("the loop changes until 39 s" in run_end.text) is (stability is Stability.OPEN)

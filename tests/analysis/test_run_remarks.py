@@ -17,9 +17,9 @@ def test_ticks_at_the_torque_limit_are_counted(ticks: int) -> None:
             return row
         return logs.replaced(row, tau=[0.0, limits_nm[row.site]])
 
-    found = list_remarks(logs.rewritten(log, change=saturate))
+    remarks = list_remarks(logs.rewritten(log, change=saturate))
     times = f"{ticks / 200:.3g} s and {2 * ticks / 200:.3g} s"
-    assert found == (f"m1 and m2 were at their torque limit for {times}",)
+    assert remarks == (f"m1 and m2 were at their torque limit for {times}",)
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])

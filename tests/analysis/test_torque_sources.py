@@ -56,10 +56,10 @@ def test_every_torque_equals_the_cores(
         expected[n] = exogenous.source_torque(
             float(t_s[n]), q[n], qd[n], lengths, rows[0], table
         )[:2]
-    found = compute_source_torque(
+    torque = compute_source_torque(
         actor, t_s, q, qd, PlanarArmRows(np.zeros(5), 0.0, lengths).place_end_effector(q, qd)
     )
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_hand_and_environment_torques_sum_to_the_record() -> None:

@@ -790,8 +790,8 @@ def judge_hidden(seed: int) -> Judged:
     drawn = Drawn(hidden.kind, write_scenario(hidden), has="hidden")
     truth = Truth(rate_per_s > 0.0, rate_per_s, abs(rate_per_s) < NEAR_PER_S)
     log = trilat_net.simulate(drawn.scenario)
-    found = trilat_net.certify(log, own_laws=hidden.own_law)
-    return Judged(drawn, truth, str(found.stability))
+    certificate = trilat_net.certify(log, own_laws=hidden.own_law)
+    return Judged(drawn, truth, str(certificate.stability))
 
 
 def read_truth(seed: int, drawn: Drawn) -> Truth:
@@ -867,12 +867,12 @@ def main() -> None:
     parser.add_argument(
         "--find-truths", action="store_true", help="write those of truths.csv anew"
     )
-    asked = parser.parse_args()
-    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        if asked.find_truths:
+    arguments = parser.parse_args()
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        if arguments.find_truths:
             _write_truths(pool.map(write_truth, range(count_stored()), chunksize=8))
             return
-        drawn, hidden = DRAWN[: asked.seeds], HIDDEN[: asked.seeds]
+        drawn, hidden = DRAWN[: arguments.seeds], HIDDEN[: arguments.seeds]
         judged = [
             *pool.map(judge_by_certify, drawn, chunksize=8),
             *pool.map(judge_hidden, hidden, chunksize=8),

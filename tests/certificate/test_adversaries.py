@@ -39,17 +39,17 @@ def _named(row: Row) -> str:
 
 @pytest.mark.parametrize("row", ROWS, ids=_named)
 def test_a_row_has_its_word_and_its_reason(row: Row) -> None:
-    found = trilat_net.certify(trilat_net.simulate(row.make()))
-    assert found.stability in row.words
-    assert row.reason in " ".join([found.end.text, *found.reasons]).lower()
+    certificate = trilat_net.certify(trilat_net.simulate(row.make()))
+    assert certificate.stability in row.words
+    assert row.reason in " ".join([certificate.end.text, *certificate.reasons]).lower()
 
 
 @pytest.mark.parametrize(
     "row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_named
 )
 def test_a_mirror_is_stable_on_live_links_too(row: Row) -> None:
-    found = trilat_net.certify(trilat_net.simulate(under_noise(row.make())))
-    assert found.stability in ("stable", "settled")
+    certificate = trilat_net.certify(trilat_net.simulate(under_noise(row.make())))
+    assert certificate.stability in ("stable", "settled")
 
 
 def test_every_row_has_its_mirror() -> None:
@@ -177,8 +177,8 @@ def _hold(found: Tally) -> None:
 )
 def test_stored_truths_are_reproducible(seed: int) -> None:
     drawn = draw_experiment(seed)
-    stored, found = read_truth(seed, drawn), find_truth(drawn)
-    assert (found.unstable, found.near) == (stored.unstable, stored.near)
+    stored, truth = read_truth(seed, drawn), find_truth(drawn)
+    assert (truth.unstable, truth.near) == (stored.unstable, stored.near)
 
 
 def test_a_run_without_motion_is_read_whole() -> None:
@@ -216,12 +216,12 @@ def test_a_run_without_motion_is_read_whole() -> None:
 def test_stored_truths_and_words_are_reproducible(seeds: Iterable[int]) -> None:
     for seed in seeds:
         drawn = draw_experiment(seed)
-        stored, found = read_truth(seed, drawn), find_truth(drawn)
-        assert (found.unstable, found.near) == (stored.unstable, stored.near), seed
-        if None in (found.root_per_s, stored.root_per_s):
-            assert found.root_per_s is stored.root_per_s, seed
+        stored, truth = read_truth(seed, drawn), find_truth(drawn)
+        assert (truth.unstable, truth.near) == (stored.unstable, stored.near), seed
+        if None in (truth.root_per_s, stored.root_per_s):
+            assert truth.root_per_s is stored.root_per_s, seed
         else:
-            assert found.root_per_s == pytest.approx(stored.root_per_s, rel=1e-3, abs=1e-5), (
+            assert truth.root_per_s == pytest.approx(stored.root_per_s, rel=1e-3, abs=1e-5), (
                 seed
             )
         assert say_of(trilat_net.simulate(drawn.scenario)) == say_of_run(drawn.scenario), seed
@@ -231,5 +231,5 @@ def test_stored_truths_and_words_are_reproducible(seeds: Iterable[int]) -> None:
 @settings(max_examples=8)
 @given(st.integers(0, 2**32 - 1))
 def test_unstable_runs_are_never_called_stable(seed: int) -> None:
-    judged = judge_experiment(seed, stored=False)
-    assert not any(tally([judged], by).false_ok for by in ("certified", "swept"))
+    judged_experiment = judge_experiment(seed, stored=False)
+    assert not any(tally([judged_experiment], by).false_ok for by in ("certified", "swept"))

@@ -295,19 +295,19 @@ def test_a_session_has_a_short_name(tmp_path: Path) -> None:
 
 def test_foreign_text_cannot_control_a_terminal() -> None:
     """Texts, cells, titles and JSON contain letters alone, whatever a peer or a file put into them."""
-    said, attack = io.StringIO(), "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
-    console = TextConsole(file=said, force_terminal=True, width=200)
+    stream, attack = io.StringIO(), "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
+    console = TextConsole(file=stream, force_terminal=True, width=200)
     table = Table(title=attack)
     table.add_column(attack)
     table.add_row(attack)
     for one in (attack, table):
         console.print(one)
-    with contextlib.redirect_stdout(said):
+    with contextlib.redirect_stdout(stream):
         print_line(attack)
         print_json({"text": attack})
-    shown = re.sub(r"\x1b\[[\d;]*m", "", said.getvalue())  # the console's own colours
+    shown = re.sub(r"\x1b\[[\d;]*m", "", stream.getvalue())  # the console's own colours
     assert all(letter.isprintable() or letter == "\n" for letter in shown)
-    assert json.loads("{" + said.getvalue().rpartition("{")[2]) == {"text": attack}
+    assert json.loads("{" + stream.getvalue().rpartition("{")[2]) == {"text": attack}
 
 
 @pytest.mark.parametrize("command", ["figure", pytest.param("report", marks=pytest.mark.long)])

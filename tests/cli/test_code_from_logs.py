@@ -291,9 +291,9 @@ ONLY_NAMING_OWN: dict[str, list[str]] = {
 def test_commands_run_own_code_as_documented(name: str, place: Path) -> None:
     (place / "mylaws.py").write_text(LAW)
     setting = ("--set", "sites.s.control.law=mylaws:Spring", "--set", "duration_s=0.5")
-    shown = trilat("scenario", "show", "paper", *setting, cwd=place).succeeds()
+    output = trilat("scenario", "show", "paper", *setting, cwd=place).succeeds()
     (place / "own.toml").write_text(
-        shown.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4")
+        output.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4")
     )
     trilat("experiment", "new", "own-reaching.toml", cwd=place).succeeds()
     shorten(place / "own-reaching.toml")
@@ -566,7 +566,7 @@ def test_a_compiled_law_runs_from_the_named_file(place: Path) -> None:
         "    def torque(self, now):\n        for i in range(now.joints):\n"
         "            now.tau[i] = now.gravity[i] - self.K * (now.q[i] - now.q_des[i])\n"
     )
-    made = trilat(
+    ended = trilat(
         "sim",
         "two_sites",
         "--duration",
@@ -575,13 +575,13 @@ def test_a_compiled_law_runs_from_the_named_file(place: Path) -> None:
         "control.law=quick:Spring",
         cwd=folder,
     )
-    assert made.code == 0
+    assert ended.code == 0
     allowed_code.clear()
-    shown = subprocess.run(
+    process = subprocess.run(
         [*COMMAND, "verify", "laws/two_sites.mcap", "--law", "laws/quick.py"],
         cwd=place,
         capture_output=True,
         text=True,
     )
-    assert "100/100 records identical" in shown.stdout, shown.stderr
+    assert "100/100 records identical" in process.stdout, process.stderr
     assert not imports(place)

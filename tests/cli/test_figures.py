@@ -43,9 +43,9 @@ def test_the_default_is_pdf_and_png(folder: Path) -> None:
 
 
 def test_the_list_names_impossible_figures(folder: Path) -> None:
-    printed = trilat("figure", "run.mcap", "--list", cwd=folder).succeeds()
-    assert "settling times" in printed
-    assert "no site has a wall" in printed
+    output = trilat("figure", "run.mcap", "--list", cwd=folder).succeeds()
+    assert "settling times" in output
+    assert "no site has a wall" in output
     rows = json.loads(trilat("figure", "run.mcap", "--list", "--json", cwd=folder).succeeds())
     absent = {row["name"]: row["absent"] for row in rows}
     assert absent["positions"] is None

@@ -12,7 +12,7 @@ AT = ("--pose", "0.07,0.23")
 
 
 def test_output_has_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
-    printed = trilat(
+    output = trilat(
         "linear", "p_d_margin", "--set", "control.d=0.9", *AT, cwd=tmp_path
     ).succeeds()
     for text in (
@@ -22,31 +22,31 @@ def test_output_has_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
         "q1 of m1, m2, s",
         "unstable:",
     ):
-        assert text in printed
-    assert "stable for common delays up to" in printed
-    assert "2 roots are zero by structure" in printed
+        assert text in output
+    assert "stable for common delays up to" in output
+    assert "2 roots are zero by structure" in output
 
 
 @pytest.mark.long
 def test_output_says_where_stability_changes_over_keys(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.1:3", "--over", "link.delay_ms=1:50")
-    printed = trilat(
+    output = trilat(
         "linear", "p_d_margin", "--no-ports", "--pose=-0.1,0.3", *over, cwd=tmp_path
     ).succeeds()
-    assert "all sites at (-0.1000, 0.3000) rad" in printed
-    assert "control.d from 0.1 to 3: stable from 0.96" in printed
-    assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in printed
+    assert "all sites at (-0.1000, 0.3000) rad" in output
+    assert "control.d from 0.1 to 3: stable from 0.96" in output
+    assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in output
 
 
 @pytest.mark.long
 def test_json_has_all_results(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.5:2")
-    told = json.loads(
+    facts = json.loads(
         trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds()
     )
-    assert told["verdict"] == "stable"
-    assert len(told["continuous"]["roots"]) == 6
-    (edge,) = told["edges"]["control.d"]
+    assert facts["verdict"] == "stable"
+    assert len(facts["continuous"]["roots"]) == 6
+    (edge,) = facts["edges"]["control.d"]
     assert edge["stable_above"] is True
 
 

@@ -96,9 +96,9 @@ def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
     assert done.code == 1
     assert "FAIL sequence" in done.out
     assert "missing s/state 7-9" in done.out
-    found = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
-    assert not found["sound"]
-    (sequence,) = (each for each in found["checks"] if each["check"] == "sequence")
+    facts = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
+    assert not facts["sound"]
+    (sequence,) = (each for each in facts["checks"] if each["check"] == "sequence")
     assert {place["text"] for place in sequence["places"]} == {
         "missing s/state 7-9",
         "missing s/state 40",

@@ -143,10 +143,10 @@ def test_reports_lie_beside_logs_and_keep_files(tmp_path: Path) -> None:
         "summary.json",
     }
     assert "  run/summary.json" in text.splitlines()
-    drawn = trilat("report", "run.mcap", "-o", "drawn", "--png", cwd=tmp_path).succeeds()
+    output = trilat("report", "run.mcap", "-o", "drawn", "--png", cwd=tmp_path).succeeds()
     pictures = {f"  drawn/{path.name}" for path in (tmp_path / "drawn").glob("*.png")}
     assert "  drawn/certificate.png" in pictures
-    assert pictures <= set(drawn.splitlines())
+    assert pictures <= set(output.splitlines())
     links = [line for line in text.splitlines() if line.startswith("link ")]
     assert [
         line.partition(": stated uniform 50 +- 23.1 ms; effective ")[0] for line in links

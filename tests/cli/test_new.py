@@ -16,13 +16,13 @@ from tests.cli.running import started, trilat
 def test_the_skeleton_is_a_law_and_replaces_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = trilat("new", "law", "soft_law.py", cwd=tmp_path)
-    assert made.code == 0
-    assert "--set control.law=soft_law:SoftLaw" in made.out
-    assert "python -m pytest test_soft_law.py" in made.out
-    assert "trilat report soft_law.mcap --law soft_law.py" in made.out
+    ended = trilat("new", "law", "soft_law.py", cwd=tmp_path)
+    assert ended.code == 0
+    assert "--set control.law=soft_law:SoftLaw" in ended.out
+    assert "python -m pytest test_soft_law.py" in ended.out
+    assert "trilat report soft_law.mcap --law soft_law.py" in ended.out
     head = (tmp_path / "soft_law.py").read_text().split('"""')[1]
-    printed = [line.strip() for line in made.out.splitlines() if line.startswith("  trilat")]
+    printed = [line.strip() for line in ended.out.splitlines() if line.startswith("  trilat")]
     assert len(printed) == 3
     assert [line for line in head.splitlines() if line.startswith("trilat")] == printed
     monkeypatch.chdir(tmp_path)
@@ -63,13 +63,13 @@ def test_the_test_of_the_skeleton_passes(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_reports_judge_permitted_laws_like_certify(tmp_path: Path) -> None:
-    made = trilat("new", "law", "mine.py", cwd=tmp_path)
-    assert "trilat certify mine.mcap --law mine.py" in made.out
+    ended = trilat("new", "law", "mine.py", cwd=tmp_path)
+    assert "trilat certify mine.mcap --law mine.py" in ended.out
     run = ["sim", "free", "--set", "control.law=mine:Mine", "--duration", "8"]
     trilat(*run, "-o", "mine.mcap", cwd=tmp_path).succeeds()
     allowed = ["mine.mcap", "--law", "mine.py", "--json"]
     certified = json.loads(trilat("certify", *allowed, cwd=tmp_path).out)
-    (printed,) = (line for line in made.out.splitlines() if "trilat certify" in line)
+    (printed,) = (line for line in ended.out.splitlines() if "trilat certify" in line)
     assert trilat(*shlex.split(printed)[1:], cwd=tmp_path).code == 0
     assert trilat("certify", *allowed, cwd=tmp_path).code == 1, "settled is not stable"
     reported = json.loads(trilat("report", *allowed, cwd=tmp_path).out)
@@ -85,11 +85,11 @@ def test_reports_judge_permitted_laws_like_certify(tmp_path: Path) -> None:
     ],
 )
 def test_skeletons_of_hand_and_plant_run(kind: str, key: str, tmp_path: Path) -> None:
-    made = trilat("new", kind, f"my_{kind}.py", cwd=tmp_path)
-    assert made.code == 0
-    assert key in made.out
+    ended = trilat("new", kind, f"my_{kind}.py", cwd=tmp_path)
+    assert ended.code == 0
+    assert key in ended.out
     trilat("new", kind, f"my_{kind}.py", cwd=tmp_path).refuses(f"my_{kind}.py", "exists")
-    command = next(line.strip() for line in made.out.splitlines() if "trilat sim" in line)
+    command = next(line.strip() for line in ended.out.splitlines() if "trilat sim" in line)
     words = [*shlex.split(command)[1:], "--duration", "0.5"]
     ran = trilat(*words, cwd=tmp_path)
     assert ran.code == 0, ran.err

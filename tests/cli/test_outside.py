@@ -22,9 +22,9 @@ SHORT = ("--duration", "0.1")
 
 
 def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
-    assert found is not None
-    return found[1]
+    match = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
+    assert match is not None
+    return match[1]
 
 
 def test_the_page_works_as_written(tmp_path: Path) -> None:
@@ -46,8 +46,8 @@ def test_the_page_works_as_written(tmp_path: Path) -> None:
     assert "6000/6000 records identical" in checked.out
     assert "mylaws:Spring of m1, m2, s with K = 80; its file is the one that ran" in checked.out
     assert demo[:2] == ["demo", "paper"]
-    shown = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
-    shown.succeeds()
+    ended = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
+    ended.succeeds()
     assert open_log(tmp_path / "slave.mcap").scenario.sites["m1"].control.Kd == (3.0, 3.0)
 
 
@@ -91,10 +91,10 @@ def read_input_table() -> list[tuple[str, str, str]]:
     rows = re.findall(r"^\| (`now\..*?) \| (.*?) \| (.*?) \|", DOC.read_text("utf-8"), re.M)
     fields = []
     for names, shape, units in rows:
-        found = re.findall(r"`now\.(\w+)`", names)
-        stated = units.split(", ") if ", " in units else [units] * len(found)
+        matches = re.findall(r"`now\.(\w+)`", names)
+        stated = units.split(", ") if ", " in units else [units] * len(matches)
         stated = ["" if unit == "–" else unit for unit in stated]
-        fields += [(name, shape, unit) for name, unit in zip(found, stated, strict=True)]
+        fields += [(name, shape, unit) for name, unit in zip(matches, stated, strict=True)]
     return fields
 
 

@@ -107,7 +107,7 @@ assert not imported & {{"zenoh", "sites", "recorder", "live"}}, imported
 
 def elsewhere(folder: Path, *commands: str) -> str:
     """Runs commands with only those modules that every system has; returns their output as UTF-8."""
-    program = PROGRAM.format(commands=[words.split() for words in commands])
+    program = PROGRAM.format(commands=[command.split() for command in commands])
     env = {**PLAIN, **prepare_process(folder / "start")}
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=folder, env=env, capture_output=True

@@ -37,8 +37,8 @@ def test_shown_text_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     copy = tmp_path / "copy.toml"
     copy.write_text(text)
     assert load_scenario(copy).sha256 == load_scenario(name).sha256
-    said = trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
-    assert f"sha256 {load_scenario(name).sha256[:16]}" in said
+    output = trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
+    assert f"sha256 {load_scenario(name).sha256[:16]}" in output
 
 
 def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
@@ -92,10 +92,10 @@ def test_refused_real_arms_name_a_working_command(
     sim = ("sim", "two_operators.toml", *wanted, *options)
     refused = trilat(*sim, cwd=tmp_path)
     assert refused.code == 2
-    words = shlex.split(refused.err.rpartition("run: trilat ")[2])
-    assert words[:2] == ["sim", "two_operators.toml"]
-    trilat(*words, cwd=tmp_path).succeeds()
-    settings = [word for word in words if "=" in word]
+    arguments = shlex.split(refused.err.rpartition("run: trilat ")[2])
+    assert arguments[:2] == ["sim", "two_operators.toml"]
+    trilat(*arguments, cwd=tmp_path).succeeds()
+    settings = [word for word in arguments if "=" in word]
     assert set(options[1:]) <= set(settings), "what was asked for stays"
     log = tn.open_log(tmp_path / "rehearsal.mcap")
     assert (log.scenario.seed, log.scenario.duration_s) == (3, 0.1)
@@ -113,8 +113,8 @@ def test_show_prints_the_scenario_of_a_log(tmp_path: Path) -> None:
     text = load_scenario("two_sites", {"duration_s": 0.2}).text
     (tmp_path / "own.toml").write_text(text, encoding="utf-8")
     trilat("sim", "./own.toml", "-o", "run.mcap", cwd=tmp_path).succeeds()
-    shown = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
-    assert shown.succeeds() == text
+    ended = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
+    assert ended.succeeds() == text
     changed = trilat("scenario", "show", "run.mcap", "--seed", "3", cwd=tmp_path)
     changed.refuses("printed as it is", "mine.toml")
     trilat("scenario", "show", "none.mcap", cwd=tmp_path).refuses("none.mcap")

@@ -80,9 +80,9 @@ def forged() -> bytes:
 
 
 def changed() -> bytes:
-    taken = taken_apart(whole())
-    taken.metadata("trilat.session")["commit"] = "0" * 40
-    return taken.bytes()
+    pieces = taken_apart(whole())
+    pieces.metadata("trilat.session")["commit"] = "0" * 40
+    return pieces.bytes()
 
 
 def newer() -> bytes:
@@ -129,6 +129,6 @@ def test_reports_use_the_requested_coverage(
     monkeypatch.setattr(page, "write_report", lambda *_, verdicts, **__: [*verdicts][:0])
     file = tmp_path / "run.mcap"
     file.write_bytes(MADE["sparse"]())
-    found = conclude(open_log(file), tmp_path, min_coverage=0.5)
-    assert {line.check: line.passed for line in found.findings}["records"]
-    assert not any("less than 99.9 %" in note for note in found.notes)
+    conclusion = conclude(open_log(file), tmp_path, min_coverage=0.5)
+    assert {line.check: line.passed for line in conclusion.findings}["records"]
+    assert not any("less than 99.9 %" in note for note in conclusion.notes)

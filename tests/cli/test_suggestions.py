@@ -178,7 +178,7 @@ def test_the_next_command_permits_the_law_that_ran(tmp_path: Path) -> None:
     text = SUM_OF_NOTHING.replace("sum_of_nothing", "0.0")
     (tmp_path / "torques.py").write_text(text, "utf-8")
     words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
-    printed = trilat(*words, "--duration", "0.1", cwd=tmp_path).succeeds()
-    (law,) = re.findall(r"next: trilat report run\.mcap --law (\S+)", printed)
+    output = trilat(*words, "--duration", "0.1", cwd=tmp_path).succeeds()
+    (law,) = re.findall(r"next: trilat report run\.mcap --law (\S+)", output)
     judged = trilat("verify", "run.mcap", "--law", law, cwd=tmp_path).out
     assert "200/200 records identical" in judged

@@ -77,11 +77,11 @@ def test_shells_complete_commands(words: str, found: set[str]) -> None:
 
 @pytest.mark.long
 def test_created_files_are_named_in_json(tmp_path: Path) -> None:
-    made = json.loads(
+    facts = json.loads(
         trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds()
     )
-    assert made["files"] == ["two_sites.mcap"]
-    assert made["sites"]["m"]["records"] == 100
+    assert facts["files"] == ["two_sites.mcap"]
+    assert facts["sites"]["m"]["records"] == 100
     asked = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
     assert json.loads(trilat(*asked, cwd=tmp_path).succeeds())["records"] == {
         "m": 100,

@@ -55,12 +55,12 @@ def test_two_sizes_push_one_joint(folder: Path) -> None:
 
 
 def test_sizes_are_separated_from_linear_growth(folder: Path) -> None:
-    found = json.loads(
+    facts = json.loads(
         trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds()
     )
-    assert found["linear"]["smallest"] == 1e-9
-    assert found["linear"]["text"].startswith("linear from 1e-09 to 0.001 rad at all joints")
-    assert [one["push"].split()[0] for one in found["pushes"]] == [
+    assert facts["linear"]["smallest"] == 1e-9
+    assert facts["linear"]["text"].startswith("linear from 1e-09 to 0.001 rad at all joints")
+    assert [push["push"].split()[0] for push in facts["pushes"]] == [
         f"{10.0**n:g}" for n in range(-9, -2)
     ]
 

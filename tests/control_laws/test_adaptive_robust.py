@@ -74,10 +74,10 @@ def mean_dissipation(log: Log, without: float) -> float:
 
 
 def test_residue_is_the_maximum_of_its_function() -> None:
-    found = minimize_scalar(
+    minimum = minimize_scalar(
         lambda x: x * x / np.sqrt(1.0 + x * x) - x, bounds=(0.0, 5.0), method="bounded"
     )
-    assert -found.fun == pytest.approx(ROBUST_RESIDUE, rel=1e-9)
+    assert -minimum.fun == pytest.approx(ROBUST_RESIDUE, rel=1e-9)
     r = np.linspace(-30.0, 30.0, 2001)
     worst = max(abs(x) * 2.0 - x * robust_torque(2.0, 0.4, x) for x in r)
     assert worst <= ROBUST_RESIDUE * 2.0 * 0.4

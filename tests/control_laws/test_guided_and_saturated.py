@@ -92,11 +92,11 @@ def test_lee_and_spong_bound_holds_at_edge(
     """As published, and with K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
-    told = describe_law_conditions(
+    conditions = describe_law_conditions(
         unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme)
     )
     text = "4 (d1 - K1 h / 2) (d2" if scheme == "digital" else "4 d1 d2 >= (T1 + T2)^2 K1 K2"
-    assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in told[0]
+    assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in conditions[0]
 
 
 @pytest.mark.long
@@ -267,11 +267,13 @@ def test_the_condition_includes_the_masters_hands(name: str) -> None:
     """A weak hand leaves the gain below one, and the strongest hand does not."""
     loop, delay_ms, _ = HELD_LOOPS[name]
     for held, verdict in ((0.0, "holds"), (3.0, "holds"), (loop["hand"], "does not hold")):
-        told = describe_law_conditions(impedances(loop, constant(delay_ms), 12.0, hand=held))[0]
+        condition = describe_law_conditions(
+            impedances(loop, constant(delay_ms), 12.0, hand=held)
+        )[0]
         # the hand may let go
         gain = max(largest_loop_gain(loop, 0.0), largest_loop_gain(loop, held))
-        assert f" {verdict}: the loop gain is at most " in told
-        stated = float(told.partition("at most ")[2].partition(",")[0])
+        assert f" {verdict}: the loop gain is at most " in condition
+        stated = float(condition.partition("at most ")[2].partition(",")[0])
         assert stated == pytest.approx(gain, rel=5e-3)
 
 
@@ -305,12 +307,12 @@ SWINGS = (
 
 
 def test_gains_below_one_need_constant_delays() -> None:
-    told = describe_law_conditions(impedances(SWINGING, SWING, 10.0))[0]
-    assert "is undecided: known for constant delays" in told
-    told = describe_law_conditions(impedances(SWINGING, constant(440.0), 10.0))[0]
-    assert " holds: the loop gain is at most 0.9" in told
-    told = describe_law_conditions(impedances(SWINGING, SWING, 10.0, wall=False))[0]
-    assert " holds: the slave touches nothing" in told
+    condition = describe_law_conditions(impedances(SWINGING, SWING, 10.0))[0]
+    assert "is undecided: known for constant delays" in condition
+    condition = describe_law_conditions(impedances(SWINGING, constant(440.0), 10.0))[0]
+    assert " holds: the loop gain is at most 0.9" in condition
+    condition = describe_law_conditions(impedances(SWINGING, SWING, 10.0, wall=False))[0]
+    assert " holds: the slave touches nothing" in condition
 
 
 @pytest.mark.long

@@ -213,7 +213,9 @@ def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     write_virtual_log(two_sites("without qdd", 0.001, duration_s=26.0), stream)
     responses = compute_log_metrics(opened(stream.getvalue())).responses
     felt = next(
-        one for one in responses if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+        response
+        for response in responses
+        if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
     expected = transmitted(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
         500.0 / (2j * np.pi) + 5.0

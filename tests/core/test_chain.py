@@ -24,10 +24,14 @@ each = pytest.mark.parametrize("name", REFERENCES)
 def build(name: str, **drive: float) -> Arm:
     joints = REFERENCES[name].chain.joints
     made = [
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
-        for one in joints
+        ChainJoint(
+            joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
+        )
+        for joint in joints
     ]
-    return Arm(build_chain(made, MAX_JOINTS), np.concatenate([one.inertia for one in joints]))
+    return Arm(
+        build_chain(made, MAX_JOINTS), np.concatenate([joint.inertia for joint in joints])
+    )
 
 
 def apart(got: Array, wanted: Array) -> float:

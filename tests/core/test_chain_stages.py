@@ -19,11 +19,11 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
     """Returns a site with the chain in a state; with its reference, v and a are those of the state."""
     chain = REFERENCES[name].chain
     joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m)
-        for one in chain.joints
+        ChainJoint(joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m)
+        for joint in chain.joints
     )
     n = len(joints)
-    theta = np.concatenate([one.inertia for one in chain.joints])
+    theta = np.concatenate([joint.inertia for joint in chain.joints])
     law = Gains(Lambda=(LAMBDA,), theta_hat0=theta, known=theta, **gains)  # type: ignore[arg-type]
     arrays = build_site_arrays(
         SiteSetup(
@@ -77,13 +77,14 @@ def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
     """G - K e - d qd - Kd ed, where G is the torque of inverse dynamics for the arm at rest."""
     for state in REFERENCES[name].states:
         arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
-        found = find_torque(arrays)
+        torque = find_torque(arrays)
         still = 0.0 * state.q
         arm = Arm(
-            arrays.chain, np.concatenate([one.inertia for one in REFERENCES[name].chain.joints])
+            arrays.chain,
+            np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints]),
         )
         moving(arm, state._replace(qd=still, a=still), still)
         wanted = torque_for(arm, still, still)
         assert np.abs(wanted).max() > 1e-3
         wanted += 7.0 * state.v / LAMBDA - 2.0 * state.qd + 5.0 * state.a / LAMBDA
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(torque, wanted, rtol=1e-9, atol=1e-9)

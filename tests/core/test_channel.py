@@ -163,15 +163,15 @@ def test_in_order_no_sample_overtakes_an_older_one() -> None:
 
 def test_newly_ordered_links_hold_samples_back() -> None:
     first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
-    made = due(channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80)
-    assert made[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
-    assert made[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
+    due_ns = due(channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80)
+    assert due_ns[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
+    assert due_ns[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
 
 
 @given(playout_ms=st.floats(0, 300))
 def test_play_out_holds_samples_for_its_budget(playout_ms: float) -> None:
     free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).to_core_model()]), 500)
-    held = due(
+    due_ns = due(
         channel(
             [
                 UniformDelay(
@@ -181,7 +181,7 @@ def test_play_out_holds_samples_for_its_budget(playout_ms: float) -> None:
         ),
         500,
     )
-    assert (held == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
+    assert (due_ns == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
 
 
 # Changes of model.

@@ -276,8 +276,8 @@ def test_a_trace_holds_its_last_points_delay(
 def test_a_trace_may_lose_samples() -> None:
     link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
     points = parse_trace(link.trace)
-    made = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
-    assert made.tolist() == [
+    due_ns = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
+    assert due_ns.tolist() == [
         5_000_000,
         6_000_000,
         7_000_000,

@@ -243,10 +243,10 @@ def test_a_multisine_has_only_its_lines() -> None:
 
 def test_sampled_and_continuous_torques_are_separate() -> None:
     rest = np.zeros(2)
-    held = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
+    torque_source = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
     other = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(5.0, 5.0))
-    assert torque(1.0, rest, rest, held, other).tolist() == [5.0, 5.0]
-    assert torque(1.0, rest, rest, held, other, sampled=True).tolist() == [1.0, 1.0]
+    assert torque(1.0, rest, rest, torque_source, other).tolist() == [5.0, 5.0]
+    assert torque(1.0, rest, rest, torque_source, other, sampled=True).tolist() == [1.0, 1.0]
 
 
 class ConstantEffort(OwnActor, frozen=True, tag="constant_effort"):

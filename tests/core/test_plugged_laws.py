@@ -180,7 +180,7 @@ def test_names_of_several_senders_are_joined() -> None:
     a = LawChannel((SentVector("E", "J", 1), SentVector("u", "", 2, True)), 2)
     b = LawChannel((SentVector("F", "N m", 2), SentVector("E", "J", 1)), 2)
     vectors = join_received([a, b])
-    assert [one.name for one in vectors] == ["E", "u", "F"]
+    assert [vector.name for vector in vectors] == ["E", "u", "F"]
     assert a.find_columns(vectors) == [0, 1, 2, -1, -1]
     assert b.find_columns(vectors) == [2, -1, -1, 0, 1]
     with pytest.raises(ValueError, match="E with different lengths, 1 and 3 numbers"):

@@ -211,7 +211,7 @@ def test_chains_equal_pinocchios(file: str, base: str, tip: str, n: int) -> None
 def mend(text: str, link: str, given: LinkInertia) -> str:
     """Returns a file with a mass and an inertia of a link written into its XML."""
     root = ElementTree.fromstring(text)
-    element = next(one for one in root.findall("link") if one.get("name") == link)
+    element = next(match for match in root.findall("link") if match.get("name") == link)
     inertial = element.find("inertial")
     if inertial is None:
         inertial = ElementTree.SubElement(element, "inertial")

@@ -43,9 +43,9 @@ def test_stacked_tables_hold_each_sites_own() -> None:
     setups = [scenario.setup(name) for name in scenario.names]
     whole = stack_site_arrays(setups)
     for n, one in enumerate(setups):
-        own = build_site_arrays(one)
-        assert whole.site[n].tobytes() == own.site.tobytes()
-        assert whole.links[n].tobytes() == own.links.tobytes()
-        assert whole.ramps[n].tobytes() == own.ramps.tobytes()
+        site_arrays = build_site_arrays(one)
+        assert whole.site[n].tobytes() == site_arrays.site.tobytes()
+        assert whole.links[n].tobytes() == site_arrays.links.tobytes()
+        assert whole.ramps[n].tobytes() == site_arrays.ramps.tobytes()
         mine = whole.actors[n][whole.actors[n]["sampled"] != 2]
-        assert mine.tobytes() == own.actors.tobytes()
+        assert mine.tobytes() == site_arrays.actors.tobytes()

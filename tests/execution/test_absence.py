@@ -196,9 +196,9 @@ def test_two_runs_over_a_gap_are_refused() -> None:
         m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
     ]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
-    found = judge_integrity(opened(taken.bytes()))
-    assert found.state is DigestState.CHANGED
-    assert "were removed or added" in found.text
+    integrity = judge_integrity(opened(taken.bytes()))
+    assert integrity.state is DigestState.CHANGED
+    assert "were removed or added" in integrity.text
 
 
 def test_sparse_logs_fail_with_the_judged_share() -> None:
@@ -296,9 +296,9 @@ def test_gaps_pass_with_possible_arrivals() -> None:
 
 
 def test_coverage_is_the_least_of_all_sites() -> None:
-    found = Coverage({"a": 1000, "b": 995}, {"a": 1000, "b": 1000, "c": 0})
-    assert found.share == 0.995
-    assert str(found) == "b 995 of 1000 ticks (99.5 %)"
+    coverage = Coverage({"a": 1000, "b": 995}, {"a": 1000, "b": 1000, "c": 0})
+    assert coverage.share == 0.995
+    assert str(coverage) == "b 995 of 1000 ticks (99.5 %)"
     assert Coverage({}, {}).share == 0.0
     assert Coverage({"a": 0}, {"a": 0}).share == 0.0
     assert "99.999 %" in str(Coverage({"a": 10**7 - 1}, {"a": 10**7}))

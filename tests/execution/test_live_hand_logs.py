@@ -59,11 +59,11 @@ def held(request: pytest.FixtureRequest) -> Log:
 
 
 def test_logs_of_people_are_verified_and_repeated(held: Log) -> None:
-    found = verify(held)
-    assert found.passed
-    assert found.identical == found.records == 3 * round(SECONDS * 1000)
+    verification = verify(held)
+    assert verification.passed
+    assert verification.identical == verification.records == 3 * round(SECONDS * 1000)
     compared = compare_with_virtual(held)
-    assert compared.fed.identical == compared.plain.identical == found.records
+    assert compared.fed.identical == compared.plain.identical == verification.records
     again = rerun(held, replace=["m1"])
     assert again.sites["m1"].identical == round(SECONDS * 1000)
     assert np.abs(held["m1"].tau_x).max() > 1.0
@@ -107,11 +107,11 @@ def test_a_changed_hand_is_found(held: Log) -> None:
     changed[400] = msgspec.structs.replace(states[400], hand=hand)
     held["m1"].__dict__["states"] = changed
     try:
-        found = verify(held)
+        verification = verify(held)
     finally:
         held["m1"].__dict__["states"] = states
-    assert found.first is not None
-    assert (found.first.site, found.first.tick) == ("m1", 400)
+    assert verification.first is not None
+    assert (verification.first.site, verification.first.tick) == ("m1", 400)
 
 
 @pytest.mark.parametrize(

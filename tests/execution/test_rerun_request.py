@@ -30,9 +30,13 @@ def test_an_unchanged_request_is_the_logs_experiment() -> None:
     for name in ("paper", "handover", "outage"):
         log = opened(recorded(name, {"duration_s": 0.3}))
         for replace in (log.sites[:1], log.sites):
-            found = resolve_rerun_request(log, replace, (), closed_loop=False)
-            assert found.scenario == log.scenario
-            assert (found.changes, found.without_effect, describe_rerun_changes(found)) == (
+            request = resolve_rerun_request(log, replace, (), closed_loop=False)
+            assert request.scenario == log.scenario
+            assert (
+                request.changes,
+                request.without_effect,
+                describe_rerun_changes(request),
+            ) == (
                 [],
                 [],
                 [],

@@ -81,7 +81,9 @@ def test_wall_forces_follow_the_shares() -> None:
         parse_scenario(text.replace("[dominance]", TOUCH + "[dominance]"))
     )
     metrics = compute_log_metrics(log)
-    pair = next(one for one in metrics.sharing_ratios if one.by_wall)
+    pair = next(
+        sharing_ratio for sharing_ratio in metrics.sharing_ratios if sharing_ratio.by_wall
+    )
     assert (metrics.label(pair.joint), metrics.unit("N m", pair.joint)) == ("x", "N")
     assert pair.expected_nm.value is not None
     assert pair.felt_nm == pytest.approx(pair.expected_nm.value, rel=1e-3)

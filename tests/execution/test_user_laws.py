@@ -89,9 +89,9 @@ def test_hidden_memory_shows_at_a_restart() -> None:
     log = opened(own("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
-    found = verify(log, resume_every=40)
-    assert found.first is not None
-    assert found.first.tick == 40
+    verification = verify(log, resume_every=40)
+    assert verification.first is not None
+    assert verification.first.tick == 40
 
 
 def test_reports_explain_hidden_memory() -> None:
@@ -100,14 +100,14 @@ def test_reports_explain_hidden_memory() -> None:
 
     def find_text(**settings: int) -> str:
         findings = run_log_checks(log, virtual=False, **settings).findings
-        return next(one.text for one in findings if one.check == "executed again")
+        return next(finding.text for finding in findings if finding.check == "executed again")
 
     words = ["trilat", "verify", *log.sources, "--law", str(law.file), "--resume-every", "100"]
     command = join_arguments(words)
     assert find_text().endswith(f"but by: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
     built_in = run_log_checks(opened(recorded("paper")), virtual=False)
-    assert not [one for one in built_in.findings if "--resume-every" in one.text]
+    assert not [finding for finding in built_in.findings if "--resume-every" in finding.text]
 
 
 def test_changed_memory_shows_at_its_tick() -> None:

@@ -136,10 +136,12 @@ def test_simulate_applies_overrides() -> None:
 
 @pytest.mark.parametrize("site", ["m1", "s"])
 def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
-    one, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
-    assert virtual.compute_boot(one, site) == virtual.compute_boot(load_scenario("paper"), site)
-    assert virtual.compute_boot(one, site) != virtual.compute_boot(other, site)
-    assert virtual.compute_boot(one, "m1") != virtual.compute_boot(one, "s")
+    scenario, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
+    assert virtual.compute_boot(scenario, site) == virtual.compute_boot(
+        load_scenario("paper"), site
+    )
+    assert virtual.compute_boot(scenario, site) != virtual.compute_boot(other, site)
+    assert virtual.compute_boot(scenario, "m1") != virtual.compute_boot(scenario, "s")
 
 
 def opened_delivered(delays: dict[Sample, int]) -> Log:

@@ -82,20 +82,24 @@ def entries(came: Deliveries) -> set[Sample]:
 
 def test_whole_logs_give_their_recorded_arrivals() -> None:
     part = short(steady(3))
-    came = complete_deliveries(part, *SENDERS)
-    assert came == read_deliveries(part)
-    assert came.entries == {state.tick: state.rx for state in part.states}
-    assert (came.first, came.last, came.unrecorded) == (0, TICKS - 1, frozenset())
+    deliveries = complete_deliveries(part, *SENDERS)
+    assert deliveries == read_deliveries(part)
+    assert deliveries.entries == {state.tick: state.rx for state in part.states}
+    assert (deliveries.first, deliveries.last, deliveries.unrecorded) == (
+        0,
+        TICKS - 1,
+        frozenset(),
+    )
 
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
 def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> None:
-    whole, came = (
+    whole, deliveries = (
         short(steady(ticks)),
         complete_deliveries(short(steady(ticks), lost), *SENDERS),
     )
-    assert came.unrecorded == lost
-    pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.entries.items() if at}
+    assert deliveries.unrecorded == lost
+    pairs = {k: sorted(entry[:2] for entry in at) for k, at in deliveries.entries.items() if at}
     assert pairs == {
         state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx
     }
@@ -105,23 +109,23 @@ def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> 
 def test_every_arrived_sample_is_listed_once(under_way: Way, lost: set[int]) -> None:
     """In order, for samples older than the newest that a record lists; later samples are unknown."""
     whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
-    came = complete_deliveries(gapped, *SENDERS)
+    deliveries = complete_deliveries(gapped, *SENDERS)
     for state in gapped.states:
-        assert came.entries[state.tick] == state.rx
-    assert sum(map(len, came.entries.values())) == len(entries(came))
+        assert deliveries.entries[state.tick] == state.rx
+    assert sum(map(len, deliveries.entries.values())) == len(entries(deliveries))
     listed = entries(read_deliveries(gapped))
     newest = [max((tick for j, tick in listed if j == peer), default=-1) for peer in (0, 1)]
-    assert {s for s in entries(came) if s[1] <= newest[s[0]]} == {
+    assert {s for s in entries(deliveries) if s[1] <= newest[s[0]]} == {
         s for s in entries(read_deliveries(whole)) if s[1] <= newest[s[0]]
     }
-    assert all(k > tick for k, at in came.entries.items() for _, tick, _ in at)
+    assert all(k > tick for k, at in deliveries.entries.items() for _, tick, _ in at)
 
 
 def test_a_lost_sample_does_not_come() -> None:
     """Sample 50 was lost, far from any gap."""
-    came = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), *SENDERS)
-    assert (0, 50) not in entries(came)
-    assert {(1, 50), (0, 20), (0, 79)} <= entries(came)
+    deliveries = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), *SENDERS)
+    assert (0, 50) not in entries(deliveries)
+    assert {(1, 50), (0, 20), (0, 79)} <= entries(deliveries)
 
 
 rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
@@ -129,8 +133,8 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
 def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
-    came = read_deliveries(short(steady(ticks)))
-    there = retime_deliveries(came, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
+    deliveries = read_deliveries(short(steady(ticks)))
+    there = retime_deliveries(deliveries, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
     assert there.last == 119 * rate_hz // 1000
     first = [
         (k, m) for k in sorted(there.entries) for peer, m, _ in there.entries[k] if peer == 0
@@ -143,8 +147,8 @@ def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz
 
 
 def test_other_rates_keep_lost_samples_lost() -> None:
-    came = read_deliveries(short({**steady(), (0, 50): None}))
-    doubled = retime_deliveries(came, 1000, 1000, [1000, 1000], [2000, 1000])
+    deliveries = read_deliveries(short({**steady(), (0, 50): None}))
+    doubled = retime_deliveries(deliveries, 1000, 1000, [1000, 1000], [2000, 1000])
     assert not {(0, 100), (0, 101)} & entries(doubled)
     assert {(0, 99), (0, 102), (1, 50)} <= entries(doubled)
 

@@ -123,7 +123,7 @@ class Evidence(NamedTuple):
 
 def find_evidence(row: Row, seeds: Seeds, ends: dict[str, str]) -> Evidence:
     sessions = [one for kind in row.kinds for one in seeds.of(kind)]
-    broken = sum(bool(one.violations) for one in sessions)
+    broken = sum(bool(session.violations) for session in sessions)
     names = find_tests((*row.virtual, *row.real))
     results = {name: ends.get(name, "not run") for name in names}
     return Evidence(row, len(sessions), broken, results)
@@ -194,12 +194,12 @@ def main() -> int:
         help="run the matrix's tests too, and write docs/data and docs/reference/faults.md",
     )
     parser.add_argument("--jobs", type=int, help="processes at a time; all cores if left out")
-    asked = parser.parse_args()
-    seeds = judge_seeds(asked.seeds, asked.jobs)
+    arguments = parser.parse_args()
+    seeds = judge_seeds(arguments.seeds, arguments.jobs)
     lines = describe_seeds(seeds)
     torques = describe_torques(seeds)
     print("\n".join([*lines, "", torques]))
-    if asked.write:
+    if arguments.write:
         ends = run_tests(
             find_tests([name for row in ROWS for name in (*row.virtual, *row.real)])
         )

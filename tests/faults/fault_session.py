@@ -318,7 +318,9 @@ class FaultSession(Session):
         published = Published()
         for name, payloads in self._payloads.items():
             for payload in payloads:
-                published.states[name] += [decode(one, State) for one in split_states(payload)]
+                published.states[name] += [
+                    decode(state, State) for state in split_states(payload)
+                ]
         for payload in self._events:
             try:
                 published.events.append(decode(payload, Event))

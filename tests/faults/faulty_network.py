@@ -159,7 +159,11 @@ class FaultyNetwork(LocalNetwork):
                 member.tell_presence(token, alive)
 
     def _named(self, name: str) -> Iterator["FaultyBus"]:
-        return (one for one in self.members if isinstance(one, FaultyBus) and one.name == name)
+        return (
+            member
+            for member in self.members
+            if isinstance(member, FaultyBus) and member.name == name
+        )
 
 
 class FaultyBus(LocalBus):

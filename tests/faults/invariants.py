@@ -227,7 +227,7 @@ def check_log(session: FaultSession) -> Iterator[str]:
         return  # its log ends where the disk does
     try:
         log = open_log(session.path)
-        found = verify(log)
+        verification = verify(log)
     except TrilatError as error:
         yield f"the log cannot be read: {error}"
         return
@@ -236,12 +236,12 @@ def check_log(session: FaultSession) -> Iterator[str]:
         name: find_altered(states, log[name].states)
         for name, states in session.published.states.items()
     }
-    if found.differing and not fed:
-        yield f"{found.differing} records differ when they are executed again"
+    if verification.differing and not fed:
+        yield f"{verification.differing} records differ when they are executed again"
     if any(altered.values()):
         if "recorder" not in fed:
             yield f"records in the log are not as they were published: {altered}"
-        elif not found.differing:
+        elif not verification.differing:
             yield f"nobody finds records that came otherwise than they were made: {altered}"
         return
     touched = any("recorder" in fault.of or fault.kind == "cut all" for fault in session.faults)

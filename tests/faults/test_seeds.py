@@ -30,9 +30,9 @@ def test_invariants_hold_in_a_hundred_whole_sessions() -> None:
     """`make faults` judges two thousand, in hours of processor time."""
     visited: Counter[str] = Counter()
     for seed in range(100):
-        judged = judge_seed(seed)
-        assert_holds(judged)
-        visited += judged.visited
+        judged_seed = judge_seed(seed)
+        assert_holds(judged_seed)
+        visited += judged_seed.visited
     assert not set(SOMETIMES) - set(visited)
 
 

@@ -69,7 +69,7 @@ class Flipping:
 
 
 def main(folder: Path) -> None:
-    (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
+    (place,) = (free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1))
     receiver = ZenohBus([place], settings=read_member_keys(folder / "m1").settings)
     wire = Flipping(place)
     sender = ZenohBus([], [wire.place], settings=read_member_keys(folder / "m2").settings)

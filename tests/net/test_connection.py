@@ -219,9 +219,9 @@ NAMES = st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=
 
 
 def port(endpoint: str) -> int:
-    found = re.fullmatch(r"tcp/127\.0\.0\.1:(\d+)", endpoint)
-    assert found, endpoint
-    return int(found[1])
+    match = re.fullmatch(r"tcp/127\.0\.0\.1:(\d+)", endpoint)
+    assert match, endpoint
+    return int(match[1])
 
 
 @given(NAMES, st.integers(0, 1000))

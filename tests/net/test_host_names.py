@@ -96,8 +96,8 @@ COMMANDS = [
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda text: text.partition(f" {UNKNOWN}")[0])
 def test_every_command_names_its_unresolvable_host(command: str, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "trilat_net", *command.split()]
-    made = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert made.returncode in (1, 2)  # 1: the examination of `doctor` found a failure
-    assert "nohost.invalid" in made.stdout + made.stderr
-    assert "resol" in made.stdout + made.stderr
-    assert "Traceback" not in made.stderr
+    process = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert process.returncode in (1, 2)  # 1: the examination of `doctor` found a failure
+    assert "nohost.invalid" in process.stdout + process.stderr
+    assert "resol" in process.stdout + process.stderr
+    assert "Traceback" not in process.stderr

@@ -77,7 +77,9 @@ class Meeting:
 
     def __init__(self, folder: Path, *, routed: bool) -> None:
         self.folder, self.members = folder, list[Bus]()
-        places = [place.replace("tcp", "tls") for place in find_free_endpoints(3)]
+        places = [
+            free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(3)
+        ]
         self._places, self._mode = (places[2:], "client") if routed else (places[:2], "peer")
         if routed:
             self.members.append(ZenohBus(places[2:], mode="router", settings=self._own(ROUTER)))
@@ -236,7 +238,7 @@ def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> 
     (tmp_path / PRIVATE_KEY).chmod(0o600)
     listed = [name for name in ALL if name != "s"]
     (tmp_path / MEMBERS).write_text(json.dumps({"member": "m1", "members": listed}))
-    (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
+    (place,) = (free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1))
     m1 = ZenohBus([place], settings=read_member_keys(tmp_path).settings)
     others = {
         name: ZenohBus([], [place], settings=read_member_keys(folder / name).settings)
@@ -524,8 +526,8 @@ def test_renewed_keys_meet_older_ones(tmp_path: Path) -> None:
     assert renew_keys(folder, ["m1"], 90) == [folder / "m1"]
     assert read_member_keys(folder / "m1").ends > datetime.now(UTC) + timedelta(days=89)
     assert read_member_keys(folder / "s").ends < datetime.now(UTC) + timedelta(days=6)
-    assert [one.value for one in load_certificate(folder / "m1").extensions] == [
-        one.value for one in names
+    assert [extension.value for extension in load_certificate(folder / "m1").extensions] == [
+        name.value for name in names
     ]
     with two_members(folder) as (site, peer):
         assert heard(

@@ -188,19 +188,19 @@ def test_memory_is_bounded_to_the_newest() -> None:
 
 
 def test_one_clock_needs_no_estimate() -> None:
-    one = exact_offset(0)
-    course = SlewedOffset(one)
+    offset = exact_offset(0)
+    course = SlewedOffset(offset)
     for at_ns in (-S, 0, 10**16):
-        assert one.extrapolate_ns(at_ns) == course.evaluate_ns(at_ns) == 0
-        assert one.error_bound_ns(at_ns, 0) == course.error_bound_ns(at_ns) == 0
-        assert one.error_bound_ns(at_ns, 7) == 7
+        assert offset.extrapolate_ns(at_ns) == course.evaluate_ns(at_ns) == 0
+        assert offset.error_bound_ns(at_ns, 0) == course.error_bound_ns(at_ns) == 0
+        assert offset.error_bound_ns(at_ns, 7) == 7
 
 
 def test_contradictions_widen_an_estimate() -> None:
-    one = exact_offset(5)
-    wider = one.widen(OffsetLimit(0, -100), None)
+    offset = exact_offset(5)
+    wider = offset.widen(OffsetLimit(0, -100), None)
     assert (wider.low_ns, wider.high_ns, wider.offset_ns) == (-100, 5, 5)
-    assert one.widen(None, None) == one
+    assert offset.widen(None, None) == offset
 
 
 def test_offsets_are_printed_in_seconds_and_microseconds() -> None:

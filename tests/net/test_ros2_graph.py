@@ -148,16 +148,16 @@ def test_type_hashes_are_those_of_all_distributions(store: str) -> None:
 def test_attachments_have_33_bytes_and_return(
     number: int, sent_unix_ns: int, gid: bytes
 ) -> None:
-    sent = Attachment(number, sent_unix_ns, gid)
-    assert len(sent.encode()) == 33
-    assert sent.encode()[16] == 0x10
-    assert parse_attachment(sent.encode()) == sent
+    attachment = Attachment(number, sent_unix_ns, gid)
+    assert len(attachment.encode()) == 33
+    assert attachment.encode()[16] == 0x10
+    assert parse_attachment(attachment.encode()) == attachment
 
 
 @given(st.binary(max_size=70))
 def test_an_invalid_attachment_is_none(data: bytes) -> None:
-    found = parse_attachment(data)
-    assert found is None or found.encode() == data
+    attachment = parse_attachment(data)
+    assert attachment is None or attachment.encode() == data
 
 
 def test_names_of_endpoints_differ() -> None:
@@ -316,9 +316,13 @@ def test_requests_without_attachment_get_no_answer(wire: Wire) -> None:
 
     until(lambda: ask(attachment=SENT.encode()))
     (answer,) = ask(attachment=SENT.encode())
-    told = parse_attachment(answer.attachment.to_bytes())
-    assert told is not None
-    assert (answer.payload.to_bytes(), told.number, told.gid) == (b"done", 1, SENT.gid)
+    attachment = parse_attachment(answer.attachment.to_bytes())
+    assert attachment is not None
+    assert (answer.payload.to_bytes(), attachment.number, attachment.gid) == (
+        b"done",
+        1,
+        SENT.gid,
+    )
     assert ask() == []
     assert wire.said == ["refused: end: a request without an attachment of ROS"]
 

@@ -202,8 +202,10 @@ def test_stepping_clocks_are_faults_and_found_again(step_ns: int) -> None:
 
 
 def meter(estimator: OffsetEstimator | None = None) -> tuple[LinkTimingMonitor, SentStamps]:
-    sent = SentStamps(8)
-    return LinkTimingMonitor(PeerClock("b", 1000, 3, exact_offset(0), estimator), sent), sent
+    sent_stamps = SentStamps(8)
+    return LinkTimingMonitor(
+        PeerClock("b", 1000, 3, exact_offset(0), estimator), sent_stamps
+    ), sent_stamps
 
 
 def figures(link: LinkTimingMonitor) -> tuple[int, ...]:

@@ -194,7 +194,7 @@ def test_sample_fields_equal_their_records(
 def test_blocks_hold_unchanged_records_in_order(sizes: list[int]) -> None:
     records = [payload(tick=n, cmd=["x" * size]) for n, size in enumerate(sizes)]
     blocks = list(join_states(records))
-    assert [one for block in blocks for one in split_states(block)] == records
+    assert [state for block in blocks for state in split_states(block)] == records
     assert all(len(block) <= max(BACKFILL_BYTES, *map(len, records)) for block in blocks)
     assert list(split_states(records[0])) == [records[0]]
 
@@ -202,10 +202,10 @@ def test_blocks_hold_unchanged_records_in_order(sizes: list[int]) -> None:
 @given(st.integers(1, 3), st.integers(1, 200))
 def test_cut_blocks_keep_earlier_records(whole: int, cut: int) -> None:
     records = [payload(tick=n) for n in range(whole)]
-    came = split_states(b"".join([*records, payload()[:cut]]))
-    assert [next(came) for _ in records] == records
+    states = split_states(b"".join([*records, payload()[:cut]]))
+    assert [next(states) for _ in records] == records
     with pytest.raises(WireError, match="malformed"):
-        next(came)
+        next(states)
 
 
 @pytest.mark.parametrize("block", [b"", bytes(MAX_BYTES + 1), b"\xc1", b"\x91" * 10_000])

@@ -64,7 +64,9 @@ def test_strangers_without_certificate_stay_outside(tmp_path: Path) -> None:
     for folder in ("ours", "theirs"):
         (tmp_path / folder).mkdir()
     ours, theirs = (encrypted("tls", tmp_path / folder) for folder in ("ours", "theirs"))
-    (endpoint,) = (place.replace("tcp", "tls") for place in find_free_endpoints(1))
+    (endpoint,) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
+    )
     router = ZenohBus([endpoint], mode="router", settings=ours.own)
     try:
         for own in (theirs.own, None):

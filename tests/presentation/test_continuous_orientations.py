@@ -233,9 +233,9 @@ def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Ite
     graph = Graph()
     ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
     for site in motions:
-        shown = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
+        site_topics = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
         for record in log[site].states:
-            shown.publish(record, 1000.0)
+            site_topics.publish(record, 1000.0)
     kind = "geometry_msgs/msg/PoseStamped"
     poses = {
         topic: [ROS.deserialize_cdr(data, kind) for data in messages]

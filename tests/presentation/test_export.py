@@ -35,7 +35,7 @@ def log() -> Log:
     )
     stats = opened(recorded("two_sites", {"duration_s": 0.4})).link_stats("m")
     new = {"site": "a", "dropped": {"not finite": 3}, "offset_us": {"b": -4}}
-    told = [msgspec.structs.replace(one, **new) for one in stats]
+    told = [msgspec.structs.replace(statistics, **new) for statistics in stats]
     return logs.rewritten(
         logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *told]
     )

@@ -234,13 +234,16 @@ def test_phase_portraits_show_e_and_its_rate():
 def test_torque_limits_are_drawn_where_reached():
     free = joint_motion.draw_control_torques(logs.simulated("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
-    held = trilat_net.simulate(
+    log = trilat_net.simulate(
         "paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20}
     )
-    figure = joint_motion.draw_control_torques(held)
+    figure = joint_motion.draw_control_torques(log)
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
     axes = figure.axes[0]
-    assert {one.get_ydata()[0] for one in axes.lines if one not in lines(axes)} == {20.0, -20.0}
+    assert {line.get_ydata()[0] for line in axes.lines if line not in lines(axes)} == {
+        20.0,
+        -20.0,
+    }
 
 
 RAMPS = [
@@ -265,12 +268,12 @@ def test_shares_are_drawn_as_they_change():
 
 def test_overview_has_all_extremes_and_the_verdict():
     log = logs.simulated("paper")
-    made = run_overview.draw_overview(log)
-    errors, _, torques, _ = made.axes
+    overview = run_overview.draw_overview(log)
+    errors, _, torques, _ = overview.axes
     for site, error, torque in zip(log.sites, lines(errors), lines(torques), strict=False):
         assert np.nanmax(error.get_ydata()) == np.abs(log[site].e).max()
         assert np.nanmax(torque.get_ydata()) == np.abs(log[site].tau).max()
-    assert str(trilat_net.certify(log).stability) in made.legends[0].get_title().get_text()
+    assert str(trilat_net.certify(log).stability) in overview.legends[0].get_title().get_text()
 
 
 def test_overlaid_runs_share_sites_and_kind():
@@ -278,12 +281,12 @@ def test_overlaid_runs_share_sites_and_kind():
         logs.simulated("paper"),
         trilat_net.simulate(parse_scenario(planar_task(0.02))),
     )
-    made = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
-    one, _ = lines(made.axes[2])
+    overlay = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
+    one, _ = lines(overlay.axes[2])
     assert np.nanmax(one.get_ydata()) == max(
         np.abs(paper[site].tau).max() for site in paper.sites
     )
-    assert [text.get_text() for text in made.legends[0].get_texts()] == ["one", "two"]
+    assert [text.get_text() for text in overlay.legends[0].get_texts()] == ["one", "two"]
     with pytest.raises(UsageError, match="in the same unit"):
         run_overview.draw_overlay({"a": paper, "b": task})
 

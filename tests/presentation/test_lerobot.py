@@ -80,27 +80,29 @@ def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarr
 
 def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
     folder = exported(tmp_path, log())
-    found = info(folder)
-    assert {key: found[key] for key in ("codebase_version", "fps", "video_path", "splits")} == {
+    info_text = info(folder)
+    assert {
+        key: info_text[key] for key in ("codebase_version", "fps", "video_path", "splits")
+    } == {
         "codebase_version": "v3.0",
         "fps": 30,
         "video_path": None,
         "splits": {"train": "0:1"},
     }
-    assert found["data_path"].format(chunk_index=0, file_index=0) == f"data/{FILE}"
+    assert info_text["data_path"].format(chunk_index=0, file_index=0) == f"data/{FILE}"
     schema = pq.read_schema(folder / "data" / FILE)
     wanted = {name: pa.list_(pa.float32(), size) for name, size in USERS.items()}
     wanted |= {"observation.state": pa.list_(pa.float32(), 4), "timestamp": pa.float32()}
     wanted |= {"next.done": pa.bool_(), **dict.fromkeys(PLACES, pa.int64())}
     assert {field.name: field.type for field in schema} == wanted
-    assert set(found["features"]) == set(wanted)
-    assert found["features"]["observation.state"] == {
+    assert set(info_text["features"]) == set(wanted)
+    assert info_text["features"]["observation.state"] == {
         "dtype": "float32",
         "shape": [4],
         "names": ["c.q1.pos", "c.q2.pos", "c.q1.vel", "c.q2.vel"],
     }
-    assert found["features"]["dominance"]["names"] == ["a", "b"]
-    assert found["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
+    assert info_text["features"]["dominance"]["names"] == ["a", "b"]
+    assert info_text["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
 
 
 @pytest.mark.parametrize("fps", [30, 7])
@@ -192,7 +194,7 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
     marked = np.vstack([whole[30:60], whole[90:120], whole[150:]])
     assert np.array_equal(frames["action.b"].to_numpy(), marked)
     (session,) = info(folder, "about")["sessions"]
-    outcomes = {one["name"]: one["outcome"] for one in session["episodes"]}
+    outcomes = {episode["name"]: episode["outcome"] for episode in session["episodes"]}
     assert outcomes == {"one": "succeeded", "two": "failed", "three": "not stated"}
     assert session["frames_outside_episodes"] == 90
     tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")

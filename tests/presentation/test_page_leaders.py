@@ -113,6 +113,6 @@ def test_the_bar_stands_below_the_slider(
             page.locator("#arms input").fill(str(share))
             assert page.inner_text(".lead output") == words
         page.locator("#arms input").fill(str(round(1000 * 11.0 / 14.0)))
-        shown = re.findall(r"(\d+) %", page.inner_text(".lead output"))
-        assert [int(number) for number in shown] == [50, 50]
+        matches = re.findall(r"(\d+) %", page.inner_text(".lead output"))
+        assert [int(number) for number in matches] == [50, 50]
         watched.assert_whole()

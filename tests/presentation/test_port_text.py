@@ -87,7 +87,9 @@ def test_failing_criteria_are_shaded() -> None:
     section = section_of("two_sites")
     above, below = draw_port_passivity(section).axes
     assert len(above.patches) == len(section.velocity.minima.below)
-    assert len(below.patches) == sum(len(one.minima.below) for one in section.two_ports)
+    assert len(below.patches) == sum(
+        len(two_port.minima.below) for two_port in section.two_ports
+    )
     above, below = draw_port_passivity(section_of("p_d_margin")).axes
     assert not above.patches
     assert not below.patches

@@ -17,12 +17,12 @@ from trilat_net.presentation.certificate_text import describe_certificate, descr
 def test_rates_printing_differently_are_explained(
     factor: float, remarks: int, *, exact: bool
 ) -> None:
-    found = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
-    assert found.twins is not None
-    assert found.twins.worst is not None
-    rate_per_s = factor * found.twins.worst.rate_per_s
+    certificate = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
+    assert certificate.twins is not None
+    assert certificate.twins.worst is not None
+    rate_per_s = factor * certificate.twins.worst.rate_per_s
     roots = LoopRoots("stable", rate_per_s, exact, "this rest: stable")
-    lines = describe_certificate(replace(found, roots=roots))
+    lines = describe_certificate(replace(certificate, roots=roots))
     told = [line for line in lines if line.text.startswith("of the two rates")]
     assert [line.mark for line in told] == ["note"] * remarks
     accuracy = "roots is exact" if exact else "roots is an approximation"
@@ -30,14 +30,18 @@ def test_rates_printing_differently_are_explained(
 
 
 def test_inapplicable_theorems_have_not_passed() -> None:
-    found = runs.run("wall").certificate
-    (line,) = [line for line in describe_certificate(found) if line.text == found.verdict.text]
+    certificate = runs.run("wall").certificate
+    (line,) = [
+        line
+        for line in describe_certificate(certificate)
+        if line.text == certificate.verdict.text
+    ]
     assert line.mark == "note"
     assert line.text.startswith(
         "the theorem does not apply (premises that fail: hands); V rose"
     )
-    assert describe_theorem(found) == [
-        f"stability theorem of the paper (V: its energy function): {found.verdict.text}"
+    assert describe_theorem(certificate) == [
+        f"stability theorem of the paper (V: its energy function): {certificate.verdict.text}"
     ]
 
 

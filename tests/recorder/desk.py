@@ -86,9 +86,9 @@ class Memory:
 
     def answer(self) -> None:
         while (question := self._questions.poll()) is not None:
-            wanted = decode(question.payload, BackfillRequest)
-            self.asked.append(wanted)
-            for payload in self.replies(encode(self.past(wanted))):
+            decoded = decode(question.payload, BackfillRequest)
+            self.asked.append(decoded)
+            for payload in self.replies(encode(self.past(decoded))):
                 question.reply(payload)
 
     def past(self, wanted: BackfillRequest) -> Backfill:

@@ -61,9 +61,9 @@ def test_wrong_arguments_are_refused(kind: Any, settings: Any, fact: str) -> Non
     ],
 )
 def test_right_arguments_reach_the_class(kind: Any, settings: Any) -> None:
-    made = make_own_instance(kind, "mine:Kind", "facts", settings, "sites.s.control")
-    assert made.settings[0] == "facts"
-    assert made.settings[1] == 1
+    instance = make_own_instance(kind, "mine:Kind", "facts", settings, "sites.s.control")
+    assert instance.settings[0] == "facts"
+    assert instance.settings[1] == 1
 
 
 def test_failures_inside_the_class_keep_their_text() -> None:

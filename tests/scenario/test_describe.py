@@ -187,12 +187,12 @@ def test_a_check_names_shares_without_effect(
     scenario = unit_scenario(
         {"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more}
     )
-    found = [
+    lines = [
         line
         for line in describe_scenario(scenario)
         if line.startswith("dominance without effect")
     ]
-    assert found == [f"dominance without effect at {line}" for line in expected]
+    assert lines == [f"dominance without effect at {line}" for line in expected]
 
 
 def test_lines_share_by_site_and_average_b() -> None:

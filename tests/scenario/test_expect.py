@@ -128,12 +128,12 @@ def test_template_names_every_key_with_valid_values() -> None:
         + "\n[expect]\n"
         + "\n".join(line.removeprefix("# ") for line in commented)
     )
-    written = parse_scenario(text).expect
+    expect = parse_scenario(text).expect
     named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
     window = ["from_s", "to_s", "site", *window_quantities(2)]
     assert set(named[: -len(window)]) | {"windows"} == set(Expect.__struct_fields__)
     assert named[-len(window) :] == window
-    assert [key for key, _ in written.windows[0].limits] == window[3:]
+    assert [key for key, _ in expect.windows[0].limits] == window[3:]
 
 
 def test_windows_have_quantities_of_all_joints() -> None:
@@ -144,8 +144,8 @@ def test_windows_have_quantities_of_all_joints() -> None:
         "q6_rad": [0.0, 1.0],
         "push5_mean_nm": [0.0, 1.0],
     }
-    asked = six(**{"expect.windows": [window]}).expect.windows[0].limits
-    assert dict(asked) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
+    limits = six(**{"expect.windows": [window]}).expect.windows[0].limits
+    assert dict(limits) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
     with pytest.raises(
         ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"
     ):

@@ -30,12 +30,12 @@ CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
 
 @pytest.mark.parametrize("zipped", [False, True])
 def test_irtt_round_trips_give_halves(tmp_path: Path, zipped: bool) -> None:
-    found = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
-    facts = found.to_dict()
+    trace = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
+    facts = trace.to_dict()
     assert facts["mean_ms"] == pytest.approx(0.5e-6 * IRTT_MEAN_NS, rel=1e-7)
     sample = facts["deviation_ms"] * math.sqrt(5 / 4)
     assert sample == pytest.approx(0.5e-6 * IRTT_DEVIATION_NS, rel=1e-5)
-    assert [t_s for t_s, _ in found.points] == pytest.approx(
+    assert [t_s for t_s, _ in trace.points] == pytest.approx(
         [(t - SENT_NS[0]) * 1e-9 for t in SENT_NS], abs=1e-6
     )
     assert import_trace(irtt(tmp_path), "irtt", way="whole").delay_ms == pytest.approx(
@@ -44,9 +44,9 @@ def test_irtt_round_trips_give_halves(tmp_path: Path, zipped: bool) -> None:
 
 
 def test_irtt_losses_and_clock_differences_are_kept(tmp_path: Path) -> None:
-    found = import_trace(irtt(tmp_path, 1, 2), "irtt")
-    assert [math.isinf(ms) for _, ms in found.points] == [False, True, True, False, False]
-    assert (found.to_dict()["lost_percent"], found.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
+    trace = import_trace(irtt(tmp_path, 1, 2), "irtt")
+    assert [math.isinf(ms) for _, ms in trace.points] == [False, True, True, False, False]
+    assert (trace.to_dict()["lost_percent"], trace.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
     with pytest.raises(ScenarioError, match="clocks do not agree"):
         import_trace(irtt(tmp_path), "irtt", way="receive")
     assert import_trace(irtt(tmp_path), "irtt", way="send").too_long == 5
@@ -55,9 +55,9 @@ def test_irtt_losses_and_clock_differences_are_kept(tmp_path: Path) -> None:
 def test_pings_keep_gaps_and_times(tmp_path: Path) -> None:
     path = tmp_path / "ping.txt"
     path.write_text(PING)
-    found = import_trace(path, "ping")
-    assert [ms for _, ms in found.points] == [30.3, 28.45, 31.0, math.inf, 32.55]
-    assert found.points[1][0] == pytest.approx(
+    trace = import_trace(path, "ping")
+    assert [ms for _, ms in trace.points] == [30.3, 28.45, 31.0, math.inf, 32.55]
+    assert trace.points[1][0] == pytest.approx(
         0.421290 - 0.0569 - (0.410606 - 0.0606), abs=1e-6
     )
     path.write_text(PING.replace("[17001828", "x [17001828"))

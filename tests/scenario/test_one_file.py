@@ -175,10 +175,10 @@ def test_low_orbit_paths_last_their_slot() -> None:
 
 
 def test_every_kind_of_file_is_found() -> None:
-    own = [
+    kinds = [
         kind
         for kind in (*OPERATORS.values(), *ENVIRONMENTS.values())
         if issubclass(kind, OwnActor)
     ]
-    assert HuntCrossley in own
+    assert HuntCrossley in kinds
     assert DELAY_MODELS["low_orbit"] is LowOrbit

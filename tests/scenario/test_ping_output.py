@@ -58,13 +58,13 @@ def test_every_probe_of_a_ping_counts(
     last_ms: float,
     end_known: bool,
 ) -> None:
-    found = import_trace(PINGS / f"{name}.txt", "ping", way="whole")
-    facts = found.to_dict()
+    trace = import_trace(PINGS / f"{name}.txt", "ping", way="whole")
+    facts = trace.to_dict()
     assert facts["samples"] == samples
     assert facts["lost_percent"] == pytest.approx(lost_percent)
-    assert (delays(found)[0], delays(found)[-1]) == (first_ms, last_ms)
+    assert (delays(trace)[0], delays(trace)[-1]) == (first_ms, last_ms)
     assert facts["end_known"] == end_known
-    assert ("does not tell how the measurement ended" in found.summary()) != end_known
+    assert ("does not tell how the measurement ended" in trace.summary()) != end_known
 
 
 @pytest.mark.parametrize("head", [IPUTILS, BSD])

@@ -195,10 +195,10 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
 def test_recorded_commands_are_restored(to: dict[str, Any], from_ns: int) -> None:
     scenario = load_scenario("paper")
     to.pop("outages_s", None)
-    made = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
-    assert parse_core_change(scenario, "m1", made.text) == made
-    assert made.model is not None
-    assert made.model.from_ns == from_ns
+    change = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
+    assert parse_core_change(scenario, "m1", change.text) == change
+    assert change.model is not None
+    assert change.model.from_ns == from_ns
 
 
 @pytest.mark.parametrize("change", [LINK, ROW], ids=["link", "shares"])

@@ -78,7 +78,7 @@ def test_grids_follow_the_leaders_as_logged(skewed: tuple[Session, Log]) -> None
     clocks = members(log)
     for site, drift_ppb in (("m1", 0), ("m2", 100_000), ("s", -100_000)):
         stats = log.link_stats(site)
-        assert all(abs(one.grid_error_us) <= 150 for one in stats)
+        assert all(abs(statistics.grid_error_us) <= 150 for statistics in stats)
         assert abs(stats[-1].slew_ppb) <= 200_000
         assert stats[-1].slew_ppb == pytest.approx(drift_ppb, abs=30_000)
         last = log[site].states[-1]
@@ -88,9 +88,9 @@ def test_grids_follow_the_leaders_as_logged(skewed: tuple[Session, Log]) -> None
 
 def test_members_on_other_clocks_are_reported(skewed: tuple[Session, Log]) -> None:
     session, log = skewed
-    told = [text for text in session.said if "another one" in text]
-    assert any(text.startswith("m1: clock of m2: another one, offset 3.0000") for text in told)
-    assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in told)
+    texts = [text for text in session.said if "another one" in text]
+    assert any(text.startswith("m1: clock of m2: another one, offset 3.0000") for text in texts)
+    assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in texts)
     setups = {event.member: event for event in log.events if event.kind == "setup"}
     assert "clock of m2: another one" in setups["s"].text
     assert setups["m2"].epoch_mono_ns == members(log)["m2"].epoch_ns

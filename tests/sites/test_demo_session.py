@@ -122,7 +122,7 @@ def test_processes_end_with_their_requester(tmp_path: Path) -> None:
     starter = started(tmp_path)
     processes = [waiting(starter, name) for name in ("m1", "recorder")]
     starter.close()
-    assert not any(is_running(int(one.pid or 0)) for one in processes)
+    assert not any(is_running(int(process.pid or 0)) for process in processes)
 
 
 def test_failing_starters_give_their_reason(tmp_path: Path) -> None:

@@ -108,7 +108,9 @@ def member(folder: Path, place: str) -> Iterator[None]:
 
 def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
-    (place, nobody) = (one.replace("tcp", "tls") for one in find_free_endpoints(2))
+    (place, nobody) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(2)
+    )
     with member(folder / "m1", place):
         assert links(folder / "s", [], [place]) == ["ok"]
         assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]  # another authority
@@ -120,7 +122,9 @@ def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) ->
 @pytest.mark.long
 def test_members_answer_over_quic(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
-    (place, nobody) = (one.replace("tcp", "quic") for one in find_free_endpoints(2))
+    (place, nobody) = (
+        free_endpoint.replace("tcp", "quic") for free_endpoint in find_free_endpoints(2)
+    )
     with member(folder / "m1", place):
         assert links(folder / "s", [], [place]) == ["ok"]
         assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]
@@ -169,7 +173,11 @@ def test_a_nearly_full_disk_is_reported(
     free: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
-    found = [one for one in examine_room(tmp_path / "not" / "there") if one.check == "disk"]
+    found = [
+        finding
+        for finding in examine_room(tmp_path / "not" / "there")
+        if finding.check == "disk"
+    ]
     assert [one.state for one in found] == [state]
 
 

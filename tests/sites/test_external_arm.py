@@ -337,45 +337,45 @@ def test_switches_hold_until_released_or_silent() -> None:
 @pytest.mark.parametrize("first", [1, 2])
 def test_of_two_holders_either_release_stops(first: int) -> None:
     """The other one has to let go and press anew: a hand-over goes by way of a stop."""
-    one, other = Switch(), 3 - first
-    assert one.hear(1, 0)
-    assert one.hear(2, 0)
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
-    assert not one.hear(first, 1, held=False)
-    assert not one.hear(other, 1)  # it still holds
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert not one.hear(other, 2)
-    assert not one.hear(other, 3, held=False)
-    assert one.hear(other, 4)
-    assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    switch, other = Switch(), 3 - first
+    assert switch.hear(1, 0)
+    assert switch.hear(2, 0)
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
+    assert not switch.hear(first, 1, held=False)
+    assert not switch.hear(other, 1)  # it still holds
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert not switch.hear(other, 2)
+    assert not switch.hear(other, 3, held=False)
+    assert switch.hear(other, 4)
+    assert switch.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
 def test_of_two_holders_either_silence_stops() -> None:
     """Silence means that its program crashed; a release and press within a tick does not
     continue the hold either.
     """
-    one = Switch()
-    assert one.hear(1, 0)
+    switch = Switch()
+    assert switch.hear(1, 0)
     for n in range(4):
-        assert one.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
-    assert not one.hear(2, 4, after_ns=1)
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert not one.hear(2, 5)
-    assert not one.hear(2, 6, held=False)
-    assert one.hear(2, 7)
-    assert not one.hear(2, 8, held=False)
-    assert one.hear(2, 9)
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+        assert switch.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
+    assert not switch.hear(2, 4, after_ns=1)
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert not switch.hear(2, 5)
+    assert not switch.hear(2, 6, held=False)
+    assert switch.hear(2, 7)
+    assert not switch.hear(2, 8, held=False)
+    assert switch.hear(2, 9)
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert switch.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
 def test_idle_switch_programs_displace_no_holder() -> None:
-    one = Switch()
-    assert one.hear(0, 0)
+    switch = Switch()
+    assert switch.hear(0, 0)
     for boot in range(1, 2 * STARTS_KEPT):
-        assert one.hear(boot, 0, held=False)
-    assert not one.hear(0, 0, after_ns=SWITCH_SILENCE_NS + 1)  # said before
-    assert one.dropped == {"old switch message": 1}
+        assert switch.hear(boot, 0, held=False)
+    assert not switch.hear(0, 0, after_ns=SWITCH_SILENCE_NS + 1)  # said before
+    assert switch.dropped == {"old switch message": 1}
 
 
 @pytest.mark.long

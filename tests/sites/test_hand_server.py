@@ -75,10 +75,10 @@ def test_a_session_with_people_is_verified_and_repeated(
     session: tuple[Log, Felt],
 ) -> None:
     log, _ = session
-    found = verify(log)
-    assert found.passed
-    assert found.identical == found.records == 3 * 1500
-    assert compare_with_virtual(log).fed.identical == found.records
+    verification = verify(log)
+    assert verification.passed
+    assert verification.identical == verification.records == 3 * 1500
+    assert compare_with_virtual(log).fed.identical == verification.records
 
 
 def test_events_name_holders_and_count_refusals(session: tuple[Log, Felt]) -> None:

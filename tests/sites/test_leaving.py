@@ -268,8 +268,8 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     session.clocks["m1"].dies_ns = 4 * S
     session.site("m1", at_ns=5 * S)
     log = session.run()
-    found = certify(log)
-    premises = {premise.name: premise for premise in found.premises}
+    certificate = certify(log)
+    premises = {premise.name: premise for premise in certificate.premises}
     assert premises["presence"].holds is False
     (first, last), rate_hz = log.absences["m1"][0], 200
     assert (
@@ -278,8 +278,8 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     assert premises["presence"].text.count("all follow from") == 2
     assert premises["presence"].text.count("delays are constant") == 2
     assert premises["records"].holds
-    assert found.evidence.functional_share == 1.0
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert certificate.evidence.functional_share == 1.0
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
     link = next(one for one in summarise_links(log) if (one.peer, one.site) == ("m1", "s"))
     assert link.loss == 0.0
 

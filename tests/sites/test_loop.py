@@ -271,9 +271,9 @@ def test_latecomers_learn_the_sessions_progress(tmp_path: Path) -> None:
     session.stranger(come_late, at_ns=2_000_000_000)
     assert session.run().complete
     assert len(refused) == 1
-    told = re.search(r"session 't' is running; (m|s) is at tick (\d+)", refused[0])
-    assert told, refused
-    assert 200 < int(told[2]) < 1000
+    match = re.search(r"session 't' is running; (m|s) is at tick (\d+)", refused[0])
+    assert match, refused
+    assert 200 < int(match[2]) < 1000
 
 
 @pytest.mark.parametrize("late_ms", [0.9, 1.0, 7.5, 300.0, 1000.0, 3000.0])
@@ -283,9 +283,9 @@ def test_slow_loops_skip_missed_ticks(late_ms: float) -> None:
     alone = Alone(clock)
     alone.run(catches_up=False)
     missed = min(int(late_ms), 2000 - 1 - 500)
-    made = [state.tick for state in alone.states]
-    assert made == [*range(500), *range(500 + missed, 2000)]
-    assert [state.t_ns for state in alone.states] == [tick * 1_000_000 for tick in made]
+    ticks = [state.tick for state in alone.states]
+    assert ticks == [*range(500), *range(500 + missed, 2000)]
+    assert [state.t_ns for state in alone.states] == [tick * 1_000_000 for tick in ticks]
     assert alone.stats.overruns == missed + (late_ms == 3000.0)  # it woke when the run was over
     numbers = [stats.tick // 100 for stats in alone.links]
     assert numbers == [n for n in range(20) if n < 5 or n >= (500 + missed) // 100]

@@ -161,9 +161,9 @@ def check_result(found: Result, transports: list[str]) -> None:
 )
 def test_the_first_line_names_the_measurement(connect: tuple[str, ...], line: str) -> None:
     needs = find_needs(tn.load_scenario("free"))
-    found = NetworkBenchmark("free", 1.0, needs, [], [], connect)
-    assert found.summary().startswith(line)
-    assert found.to_dict()["connect"] == list(connect)
+    network_benchmark = NetworkBenchmark("free", 1.0, needs, [], [], connect)
+    assert network_benchmark.summary().startswith(line)
+    assert network_benchmark.to_dict()["connect"] == list(connect)
 
 
 @pytest.mark.long
@@ -183,6 +183,10 @@ def test_loopback_is_measured() -> None:
 def test_the_command_measures_all_transports_and_draws(tmp_path) -> None:
     words = ["--benchmark", "p_d_margin", "--seconds", "3", "--figure", "network.png", "--json"]
     facts = json.loads(trilat("ping", *words, cwd=tmp_path).out)
-    assert [one["transport"] for one in facts["transports"]] == ["tcp", "tls", "quic"]
+    assert [transport["transport"] for transport in facts["transports"]] == [
+        "tcp",
+        "tls",
+        "quic",
+    ]
     assert (tmp_path / "network.png").stat().st_size > 10_000
     assert is_documented("ping --benchmark", facts)

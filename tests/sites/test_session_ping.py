@@ -17,12 +17,12 @@ from .visits import S, Visit, link_stats, ping_publishers, ping_sites
 def test_members_are_seen_without_waiting() -> None:
     party = Party(("m", "s"))
     party.start("m", "recorder")
-    found = Visit(party).look().report().members
-    assert [facts["member"] for facts in found] == ["m", "recorder"]
-    assert all(facts["answers"] >= 10 for facts in found)
+    members = Visit(party).look().report().members
+    assert [facts["member"] for facts in members] == ["m", "recorder"]
+    assert all(facts["answers"] >= 10 for facts in members)
     assert all(
         (facts["same_clock"], facts["offset_ns"], facts["bound_us"]) == (True, 0, 0.0)
-        for facts in found
+        for facts in members
     )
     assert party.members["m"].joining.membership.list_missing() == ["s"]
     party.start("s")
@@ -31,9 +31,9 @@ def test_members_are_seen_without_waiting() -> None:
 
 def test_another_clock_is_found() -> None:
     party = Party(("m", "s"))
-    away = SkewedClock(party.clock, 3 * S, 50_000)
+    skewed_clock = SkewedClock(party.clock, 3 * S, 50_000)
     party.start("m")
-    party.start("s", on_clock=away)
+    party.start("s", on_clock=skewed_clock)
     probe = Visit(party).look()
     (_, facts) = probe.report().members
     assert not facts["same_clock"]
@@ -41,7 +41,7 @@ def test_another_clock_is_found() -> None:
     bound_us = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns) / 1000
     assert (facts["offset_ns"], facts["bound_us"]) == (estimate.offset_ns, bound_us)
     now_ns = party.clock.monotonic_ns()
-    truth = away.monotonic_ns() - now_ns
+    truth = skewed_clock.monotonic_ns() - now_ns
     value = estimate.extrapolate_ns(now_ns)
     assert abs(truth - value) <= estimate.error_bound_ns(now_ns, value) + 2
 
@@ -101,17 +101,17 @@ def test_ping_json_is_as_documented() -> None:
 
 
 def test_ros_topic_delays_are_per_publisher() -> None:
-    found = ping_publishers()
-    first, second = found.publishers
+    measurements = ping_publishers()
+    first, second = measurements.publishers
     assert first["messages"] == 201
     assert (first["lost"], second["lost"]) == (0, 66)  # the last that it sent is no loss
     assert first["delay_us"] == {"min": 2000.0, "p50": 2000.0, "p99": 12000.0, "max": 12000.0}
     assert sum(first["histogram"]["counts"]) == 201
     assert first["rate_hz"] == pytest.approx(100.0, rel=0.01)
-    text = found.summary()
+    text = measurements.summary()
     assert "std_msgs/msg/String" in text
     assert "the publisher's clock is ahead" in text  # of the second
-    assert is_documented("ping --ros2", found.to_dict())
+    assert is_documented("ping --ros2", measurements.to_dict())
 
 
 def test_silent_topics_are_reported() -> None:

@@ -78,8 +78,8 @@ def test_marks_and_episodes_stand_in_the_log(tmp_path: Path) -> None:
 
     session.relay.add("program", run)
     session.play()
-    told = [event.text for event in open_log(session.path).events if event.kind == "mark"]
+    texts = [event.text for event in open_log(session.path).events if event.kind == "mark"]
     ends = ["succeeded", "failed", "ended"]
     named = zip(("one", "two", "three"), ends, strict=True)
     marked = [f"episode {name} {what}" for name, end in named for what in ("begins", end)]
-    assert told == ["look here", *marked]
+    assert texts == ["look here", *marked]

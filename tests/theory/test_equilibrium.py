@@ -22,30 +22,30 @@ TRIO = {"rate_hz": 200}
 )
 def test_a_rest_is_an_equilibrium(name: str) -> None:
     scenario = load_scenario(name, TRIO)
-    found = find_equilibrium(scenario)
+    equilibrium = find_equilibrium(scenario)
     assert np.abs(
-        compute_equilibrium_residual(derive_operating_conditions(scenario), found)
-    ).max() == pytest.approx(found.residual, abs=1e-14)
-    assert found.residual <= MAX_EQUILIBRIUM_RESIDUAL
+        compute_equilibrium_residual(derive_operating_conditions(scenario), equilibrium)
+    ).max() == pytest.approx(equilibrium.residual, abs=1e-14)
+    assert equilibrium.residual <= MAX_EQUILIBRIUM_RESIDUAL
 
 
 def test_a_settling_run_rests_where_it_ends() -> None:
     """The gravity anchor of the paper's experiment."""
-    found = find_equilibrium(load_scenario("paper", TRIO))
-    assert found.q == pytest.approx(np.tile([-0.1729, 0.0874], (3, 1)), abs=2e-3)
-    assert found.theta_hat[:, 3:] == pytest.approx(np.tile([2.0, 1.0], (3, 1)), abs=1e-6)
-    assert "the run is at rest" in found.how
+    equilibrium = find_equilibrium(load_scenario("paper", TRIO))
+    assert equilibrium.q == pytest.approx(np.tile([-0.1729, 0.0874], (3, 1)), abs=2e-3)
+    assert equilibrium.theta_hat[:, 3:] == pytest.approx(np.tile([2.0, 1.0], (3, 1)), abs=1e-6)
+    assert "the run is at rest" in equilibrium.how
 
 
 @pytest.mark.long
 def test_diverging_runs_rest_at_the_kept_mean() -> None:
     """Equal gains: the mean of the start poses is conserved."""
     scenario = load_scenario("p_d_margin", {**TRIO, "control.d": 0.1, "link.delay_ms": 400.0})
-    found = find_equilibrium(scenario)
+    equilibrium = find_equilibrium(scenario)
     starts = np.mean([site.q0_rad for site in scenario.sites.values()], axis=0)
-    assert "the run diverges at" in found.how
-    assert found.q == pytest.approx(np.tile(starts, (3, 1)), abs=1e-9)
-    assert found.q == pytest.approx(predict_equilibrium(scenario).q)
+    assert "the run diverges at" in equilibrium.how
+    assert equilibrium.q == pytest.approx(np.tile(starts, (3, 1)), abs=1e-9)
+    assert equilibrium.q == pytest.approx(predict_equilibrium(scenario).q)
 
 
 def test_the_kept_mean_weighs_damping_and_delay() -> None:
@@ -61,22 +61,22 @@ def test_the_kept_mean_weighs_damping_and_delay() -> None:
 
 def test_hammering_runs_have_a_contact_equilibrium() -> None:
     scenario = load_scenario("contact", {**TRIO, "rate_hz": 500})
-    found = find_equilibrium(scenario)
-    assert "still moves" in found.how
+    equilibrium = find_equilibrium(scenario)
+    assert "still moves" in equilibrium.how
     now = derive_operating_conditions(scenario)
     # settles at the same pose
     calm = find_equilibrium(load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0}))
     assert "at rest" in calm.how
-    assert found.q == pytest.approx(calm.q, abs=1e-9)
+    assert equilibrium.q == pytest.approx(calm.q, abs=1e-9)
     assert np.abs(compute_equilibrium_residual(now, calm)).max() <= MAX_EQUILIBRIUM_RESIDUAL
 
 
 def test_a_users_pose_is_taken_unchanged() -> None:
     scenario = load_scenario("free")
-    found = find_equilibrium(scenario, (0.1, 0.3))
-    assert found.q.tolist() == [[0.1, 0.3]] * 3
-    assert found.theta_hat == pytest.approx(np.tile([3.0, 1.0, 1.0, 2.0, 1.0], (3, 1)))
-    assert found.notes == ()
+    equilibrium = find_equilibrium(scenario, (0.1, 0.3))
+    assert equilibrium.q.tolist() == [[0.1, 0.3]] * 3
+    assert equilibrium.theta_hat == pytest.approx(np.tile([3.0, 1.0, 1.0, 2.0, 1.0], (3, 1)))
+    assert equilibrium.notes == ()
 
 
 def test_poses_out_of_rest_are_reported() -> None:

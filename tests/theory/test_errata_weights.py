@@ -119,8 +119,8 @@ def feasible(alpha: Any, Kd: Any) -> bool:
     """True if some beta >= 0, not zero, leaves nothing positive."""
     rows = passed_on(alpha, Kd)
     n = len(alpha)
-    found = linprog(np.zeros(n), rows, np.full(len(rows), 1e-9), np.ones((1, n)), [1.0])
-    return bool(found.status == 0)
+    solution = linprog(np.zeros(n), rows, np.full(len(rows), 1e-9), np.ones((1, n)), [1.0])
+    return bool(solution.status == 0)
 
 
 def test_kd_may_differ_by_scalars_only() -> None:

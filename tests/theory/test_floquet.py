@@ -47,11 +47,11 @@ def at_rest(
     scenario = load_scenario(
         scenario, here | {f"sites.{site}.hands": [] for site in scenario.names}
     )
-    found = compute_sampled_spectrum(
+    spectrum = compute_sampled_spectrum(
         derive_operating_conditions(scenario), find_equilibrium(scenario, pose), wanted
     )
-    assert found is not None
-    return Loop(scenario, found)
+    assert spectrum is not None
+    return Loop(scenario, spectrum)
 
 
 def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> float:
@@ -150,7 +150,9 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
         changes[f"sites.{site}.rate_hz"] = int(rates[n if seed % 5 < 3 else 0])
     loop = at_rest(name, changes, 6)
     reals = [root.s.real for root in loop.found.roots]
-    gap_per_s = reals[0] - next((one for one in reals if one < reals[0] - 1e-3), reals[0] - 1.0)
+    gap_per_s = reals[0] - next(
+        (real for real in reals if real < reals[0] - 1e-3), reals[0] - 1.0
+    )
     from_s = max(4.0, 2.0 / max(0.1, gap_per_s))
     to_s = from_s + max(20.0 * max(1.0, loop.found.span_s or 0.0), min(120.0, 4.0 / gap_per_s))
     size = reals[0] * to_s

@@ -36,10 +36,10 @@ def test_dips_between_grid_points_are_found(at_hz: float, width: float) -> None:
     def curve(w: Array) -> Array:
         return np.asarray(0.1 - 1.0 / (1.0 + (np.log(w / (HZ * at_hz)) / width) ** 2))
 
-    found = find_minima(curve, build_frequency_grid(1e-3, 100.0, 0.0))
-    assert found.least == pytest.approx(-0.9, rel=0.02)
-    assert found.least_hz == pytest.approx(at_hz, rel=0.2 * width)
-    (span,) = found.below
+    minima = find_minima(curve, build_frequency_grid(1e-3, 100.0, 0.0))
+    assert minima.least == pytest.approx(-0.9, rel=0.02)
+    assert minima.least_hz == pytest.approx(at_hz, rel=0.2 * width)
+    (span,) = minima.below
     assert span.from_hz == pytest.approx(max(1e-3, at_hz * np.exp(-3.0 * width)), rel=1e-6)
     assert span.to_hz == pytest.approx(min(100.0, at_hz * np.exp(3.0 * width)), rel=1e-6)
 
@@ -48,8 +48,8 @@ def test_ranges_below_levels_have_exact_edges() -> None:
     found = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
     expected = [(1 / 6, 5 / 6), (7 / 6, 11 / 6)]
     np.testing.assert_allclose(found.below, np.array(expected), rtol=1e-6)
-    begun = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
-    np.testing.assert_allclose(begun.below, [(0.6, 1.0)], rtol=1e-6)
+    minima = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
+    np.testing.assert_allclose(minima.below, [(0.6, 1.0)], rtol=1e-6)
     ended = find_minima(np.sin, HZ * np.linspace(0.1, 0.9, 200), level=0.0)
     np.testing.assert_allclose(ended.below, [(0.5, 0.9)], rtol=1e-6)
 
@@ -101,8 +101,8 @@ def test_remembered_answers_are_asked_once() -> None:
         return Y(w)
 
     w = build_frequency_grid(0.1, 1.0, 0.2)
-    known = cache_response(counted, w)
-    np.testing.assert_array_equal(known(w), Y(w))
-    np.testing.assert_array_equal(known(w), Y(w))
-    np.testing.assert_array_equal(known(w[:3]), Y(w[:3]))
+    cached_response = cache_response(counted, w)
+    np.testing.assert_array_equal(cached_response(w), Y(w))
+    np.testing.assert_array_equal(cached_response(w), Y(w))
+    np.testing.assert_array_equal(cached_response(w[:3]), Y(w[:3]))
     assert asked == [len(w), 3]

@@ -262,11 +262,11 @@ def test_energy_switching_laws_explain_missing_roots() -> None:
 
 
 def test_the_analysis_of_waves_is_whole() -> None:
-    found = analyse_linear_loop(wave_pair(1000.0), pose=(0.0, 0.0))
-    assert found.verdict == "stable"
-    assert found.sampled is None
-    assert any("continuous time only" in note for note in found.notes)
-    assert found.margin.description.startswith("stable for every common delay")
+    analysis = analyse_linear_loop(wave_pair(1000.0), pose=(0.0, 0.0))
+    assert analysis.verdict == "stable"
+    assert analysis.sampled is None
+    assert any("continuous time only" in note for note in analysis.notes)
+    assert analysis.margin.description.startswith("stable for every common delay")
 
 
 def test_lines_hold_arms_at_rest_against_hands() -> None:
@@ -288,9 +288,9 @@ def test_saturating_pulls_are_linearised_below_saturation() -> None:
         scenario = unit_scenario(
             {"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0}
         )
-        found = analyse_linear_loop(scenario, pose=(0.0, 0.0))
-        loops.append([root.s for root in found.decisive.roots])
-        assert any("small errors" in note for note in found.notes) == (
+        analysis = analyse_linear_loop(scenario, pose=(0.0, 0.0))
+        loops.append([root.s for root in analysis.decisive.roots])
+        assert any("small errors" in note for note in analysis.notes) == (
             law["law"] == "saturated_pd"
         )
     assert loops[0] == loops[1]

@@ -177,7 +177,7 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
     ]
     assert short.omitted_states == 2 * (60 - len(LOADED)) == len(whole.names) - len(short.names)
     values = [eigvals(set_common_delay(loop, 0.0).A) for loop in (whole, short)]
-    moving = [np.sort_complex(np.round(found[np.abs(found) > 1e-4], 7)) for found in values]
+    moving = [np.sort_complex(np.round(value[np.abs(value) > 1e-4], 7)) for value in values]
     assert len(moving[0]) == len(moving[1])
     assert np.abs(moving[0] - moving[1]).max() <= 1e-6
     w_rad_s = np.array([0.01, 1.0, 13.0, 200.0])
@@ -190,17 +190,19 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     """Each omitted state counts as a root at zero; the shared pose gives the others."""
     case = six("adaptive")
     loop = case.loop()
-    found = compute_delay_spectrum(loop, 3)
-    assert (found.zeros, found.drifting) == (loop.omitted_states + 6, 0)
-    assert all(residual(case.loop(all_estimates=True), root.s) <= 1e-12 for root in found.roots)
+    spectrum = compute_delay_spectrum(loop, 3)
+    assert (spectrum.zeros, spectrum.drifting) == (loop.omitted_states + 6, 0)
+    assert all(
+        residual(case.loop(all_estimates=True), root.s) <= 1e-12 for root in spectrum.roots
+    )
     # no other root is to the right of the third
-    edge = found.roots[2].s.real - 0.05
-    right = sum(2 if root.s.imag else 1 for root in found.roots)
+    edge = spectrum.roots[2].s.real - 0.05
+    right = sum(2 if root.s.imag else 1 for root in spectrum.roots)
     assert roots_within(loop, complex(edge, -60.0), complex(20.0, 60.0)) == right + 6
     sampled = compute_sampled_spectrum(case.conditions, case.rest, 3)
     assert sampled is not None
-    assert (sampled.zeros, sampled.drifting) == (found.zeros, 0)
-    for one, other in zip(sampled.roots, found.roots, strict=True):
+    assert (sampled.zeros, sampled.drifting) == (spectrum.zeros, 0)
+    for one, other in zip(sampled.roots, spectrum.roots, strict=True):
         assert abs(one.s - other.s) <= 2e-3 * abs(other.s)
 
 
@@ -248,9 +250,9 @@ def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
         "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist(),
     }
     case = six(law, rate_hz=200, **pushed)
-    found = compute_sampled_spectrum(case.conditions, case.rest, 2)
-    assert found is not None
-    root, following = (one.s for one in found.roots)
+    spectrum = compute_sampled_spectrum(case.conditions, case.rest, 2)
+    assert spectrum is not None
+    root, following = (one.s for one in spectrum.roots)
     from_s = 6.0 / (root.real - following.real)  # by then the next mode has a part in 400 left
     made = follow(case.scenario, round(200 * (from_s + 2.0)))
     late = np.diff(made[round(200 * from_s) :: 10, 1])
@@ -310,9 +312,9 @@ def test_the_p_d_bound_holds_for_chains() -> None:
     def damped(d: float, **overrides: Any) -> Linear:
         return six("p_d", **{"control.K": 20.0, "control.d": d, **overrides})
 
-    found = evaluate_criterion(damped(1.05).scenario)
-    assert found is not None
-    assert found.excess == pytest.approx(0.1)
+    criterion = evaluate_criterion(damped(1.05).scenario)
+    assert criterion is not None
+    assert criterion.excess == pytest.approx(0.1)
     assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
     edge = next(
         iterate_linear_edges(
@@ -329,7 +331,7 @@ def test_the_p_d_bound_holds_for_chains() -> None:
 def test_diverging_runs_keep_their_predicted_rest() -> None:
     """Of alike arms with alike gains the rest is near the mean of the start poses."""
     case = six("adaptive", 0.3 * OFF)
-    found = predict_equilibrium(case.scenario)
-    assert found.residual <= 1e-10
-    assert np.ptp(found.q, axis=0).max() <= 1e-9
-    assert found.q[0] == pytest.approx(np.add(POSE, 0.15 * (OFF[0] + OFF[1])), abs=0.05)
+    equilibrium = predict_equilibrium(case.scenario)
+    assert equilibrium.residual <= 1e-10
+    assert np.ptp(equilibrium.q, axis=0).max() <= 1e-9
+    assert equilibrium.q[0] == pytest.approx(np.add(POSE, 0.15 * (OFF[0] + OFF[1])), abs=0.05)

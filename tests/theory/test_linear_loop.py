@@ -33,17 +33,26 @@ def rightmost(overrides: dict[str, float]) -> complex:
 
 def test_states_and_inputs_follow_the_scenarios_order() -> None:
     scenario = load_scenario("contact")
-    found = linearise_loop(
+    linear_loop = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8))
     )
-    assert found.names == ("m.q1", "m.q2", "m.qd1", "m.qd2", "s.q1", "s.q2", "s.qd1", "s.qd2")
-    assert found.inputs == ("m.tau1", "m.tau2", "s.tau1", "s.tau2")
-    assert found.outputs == ("m.qd1", "m.qd2", "s.qd1", "s.qd2")
-    assert found.C @ np.arange(8.0) == pytest.approx([2.0, 3.0, 6.0, 7.0])
-    (delayed,) = found.delayed
+    assert linear_loop.names == (
+        "m.q1",
+        "m.q2",
+        "m.qd1",
+        "m.qd2",
+        "s.q1",
+        "s.q2",
+        "s.qd1",
+        "s.qd2",
+    )
+    assert linear_loop.inputs == ("m.tau1", "m.tau2", "s.tau1", "s.tau2")
+    assert linear_loop.outputs == ("m.qd1", "m.qd2", "s.qd1", "s.qd2")
+    assert linear_loop.C @ np.arange(8.0) == pytest.approx([2.0, 3.0, 6.0, 7.0])
+    (delayed,) = linear_loop.delayed
     assert delayed.delay_s == 0.2
     # k_f = 1: felt as if it were at the hand
-    assert delayed.B[2:4, 2:4] == pytest.approx(found.B[2:4, :2])
+    assert delayed.B[2:4, 2:4] == pytest.approx(linear_loop.B[2:4, :2])
     assert not delayed.B[4:].any()
 
 
@@ -63,11 +72,11 @@ def test_adaptive_sites_have_estimates_as_states() -> None:
 
 def test_links_of_different_delays_have_an_entry_each() -> None:
     scenario = load_scenario("free", {"links.m1->s.delay_ms": 50.0})
-    found = linearise_loop(
+    linear_loop = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
-    assert [delayed.delay_s for delayed in found.delayed] == [0.05, 0.2]
-    both = found.delayed[0].A + found.delayed[1].A
+    assert [delayed.delay_s for delayed in linear_loop.delayed] == [0.05, 0.2]
+    both = linear_loop.delayed[0].A + linear_loop.delayed[1].A
     alike = linearise_loop(
         derive_operating_conditions(load_scenario("free")),
         find_equilibrium(load_scenario("free"), POSE),
@@ -89,13 +98,14 @@ def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
 
 def test_zero_delay_is_the_one_tick_limit() -> None:
     scenario = load_scenario("free", {"link.delay_ms": 0.0})
-    found = linearise_loop(
+    linear_loop = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
     tick, none = (
-        compute_delay_spectrum(set_common_delay(found, T), 1).roots[0].s for T in (1e-3, 0.0)
+        compute_delay_spectrum(set_common_delay(linear_loop, T), 1).roots[0].s
+        for T in (1e-3, 0.0)
     )
-    tenth = compute_delay_spectrum(set_common_delay(found, 1e-4), 1).roots[0].s
+    tenth = compute_delay_spectrum(set_common_delay(linear_loop, 1e-4), 1).roots[0].s
     assert abs(tick - none) < 0.05
     assert abs(tenth - none) == pytest.approx(0.1 * abs(tick - none), rel=0.1)
 

@@ -219,10 +219,10 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     scenario, rest = settled(name)
     conditions = derive_operating_conditions(scenario)
     near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
-    found = compute_sampled_spectrum(conditions, rest, 14)
-    assert found is not None
-    assert found.verdict == near.verdict == "stable"
-    swings = [root.s for root in found.roots if root.s.imag > 0.7 * abs(root.s)][:3]
+    spectrum = compute_sampled_spectrum(conditions, rest, 14)
+    assert spectrum is not None
+    assert spectrum.verdict == near.verdict == "stable"
+    swings = [root.s for root in spectrum.roots if root.s.imag > 0.7 * abs(root.s)][:3]
     assert swings
     loop = linearise_loop(conditions, rest, all_estimates=True)
     pencil, names, _ = find_moving_part(loop)
@@ -259,14 +259,14 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     law = {"law": "p_d", "K": 120.0, "d": 12.0}
     scenario = parse_scenario(planar_task(), "planar", {"control": law})
     pose = find_mean_pose(scenario)
-    found = analyse_linear_loop(scenario, pose=pose)
-    end = found.margin.intervals[0].high
+    analysis = analyse_linear_loop(scenario, pose=pose)
+    end = analysis.margin.intervals[0].high
     assert end is not None
-    there = compute_delay_spectrum(set_common_delay(found.loop, end.delay_s), 1).rightmost
+    there = compute_delay_spectrum(set_common_delay(analysis.loop, end.delay_s), 1).rightmost
     assert there is not None
     assert there.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
     edge = next(
-        iterate_linear_edges(scenario, "control.d", 2.0, 20.0, found.rest, points=5), None
+        iterate_linear_edges(scenario, "control.d", 2.0, 20.0, analysis.rest, points=5), None
     )
     assert edge is not None
     for d, verdict in ((0.99 * edge.value, "unstable"), (1.01 * edge.value, "stable")):
@@ -289,5 +289,5 @@ def test_poses_without_loop_are_refused_by_name() -> None:
 
 def test_rests_near_singular_poses_include_damping() -> None:
     scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 0.9})
-    found = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
-    assert any("rests near a singular pose" in note for note in found.notes)
+    analysis = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
+    assert any("rests near a singular pose" in note for note in analysis.notes)

@@ -30,7 +30,7 @@ def linear(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
 
 
 def roots(found: Spectrum) -> Array:
-    return np.array([one.s for one in found.roots])
+    return np.array([root.s for root in found.roots])
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
@@ -63,11 +63,11 @@ def test_forces_are_those_of_the_four_channel_law() -> None:
 
 
 def test_the_last_tick_is_memory() -> None:
-    kept, remembered = linear(Backward), linear(Remembering)
-    assert kept.sampled is not None
+    analysis, remembered = linear(Backward), linear(Remembering)
+    assert analysis.sampled is not None
     assert remembered.sampled is not None
-    assert np.allclose(roots(kept.sampled), roots(remembered.sampled), rtol=0.0, atol=1e-6)
-    late, exact = roots(kept.sampled)[0], roots(linear("p_d").decisive)[0]
+    assert np.allclose(roots(analysis.sampled), roots(remembered.sampled), rtol=0.0, atol=1e-6)
+    late, exact = roots(analysis.sampled)[0], roots(linear("p_d").decisive)[0]
     assert 1e-4 < abs(late - exact) < 1e-2, "half a tick of delay in the damping"
 
 
@@ -102,16 +102,16 @@ def test_a_certificate_runs_no_code_from_outside() -> None:
 @pytest.mark.long
 def test_a_run_decays_at_its_roots() -> None:
     """From the poses of its sites to rest, and its edge lies at that of p_d."""
-    own = tn.linear(
+    analysis = tn.linear(
         "p_d_margin",
         {"control.law": CompiledPD, "control.d": 1.5},
         over=["control.d=0.3:3"],
         ports=True,
     )
     built_in = tn.linear("p_d_margin", {"control.d": 1.5}, over=["control.d=0.3:3"], ports=True)
-    assert own.scans[0].edges[0].value == pytest.approx(
+    assert analysis.scans[0].edges[0].value == pytest.approx(
         built_in.scans[0].edges[0].value, rel=1e-5
     )
-    assert np.allclose(own.rest.q, built_in.rest.q, atol=1e-5)
-    assert own.ports is not None
-    assert own.ports.verdict == "stable"
+    assert np.allclose(analysis.rest.q, built_in.rest.q, atol=1e-5)
+    assert analysis.ports is not None
+    assert analysis.ports.verdict == "stable"

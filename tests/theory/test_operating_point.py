@@ -19,12 +19,14 @@ from trilat_net.scenario import Scenario, load_scenario
 
 
 def test_shares_and_links_are_those_at_the_end() -> None:
-    found = derive_operating_conditions(load_scenario("training"))
-    assert found.alpha.sum(axis=1) == pytest.approx(1.0)
-    row = dict(zip(found.names, found.alpha[found.names.index("s")], strict=True))
+    conditions = derive_operating_conditions(load_scenario("training"))
+    assert conditions.alpha.sum(axis=1) == pytest.approx(1.0)
+    row = dict(
+        zip(conditions.names, conditions.alpha[conditions.names.index("s")], strict=True)
+    )
     assert row["m1"] == pytest.approx(0.1)
     assert any(
-        "the dominance factors of s change during the run" in note for note in found.notes
+        "the dominance factors of s change during the run" in note for note in conditions.notes
     )
     half = derive_operating_conditions(load_scenario("training", {"duration_s": 11.0}))
     assert half.alpha[half.names.index("s"), 0] == pytest.approx(0.5)
@@ -50,16 +52,16 @@ def test_only_constant_recorded_torques_stay() -> None:
     ]
     swings = {"kind": "multisine", "amplitude_nm": [1.0, 0.0], "frequencies_hz": [1.0]}
     scenario = load_scenario("free", {"sites.m1.hands": [*recorded, swings]})
-    found = derive_operating_conditions(scenario)
-    assert [actor.a for actor in found.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
-    assert any("still swings at the end" in note for note in found.notes)
+    conditions = derive_operating_conditions(scenario)
+    assert [actor.a for actor in conditions.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
+    assert any("still swings at the end" in note for note in conditions.notes)
     assert len(extend_scenario(scenario, 100.0).sites["m1"].hands) == 2
 
 
 def test_varying_quantities_have_their_mean() -> None:
-    found = derive_operating_conditions(load_scenario("jitter", {"duration_s": 5.0}))
-    assert found.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
-    assert any("linearised at the mean of each" in note for note in found.notes)
+    conditions = derive_operating_conditions(load_scenario("jitter", {"duration_s": 5.0}))
+    assert conditions.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
+    assert any("linearised at the mean of each" in note for note in conditions.notes)
 
 
 @pytest.mark.parametrize(
@@ -85,10 +87,10 @@ def test_continuing_runs_change_nothing() -> None:
     longer = extend_scenario(load_scenario("training", {"duration_s": 5.0}), 50.0)
     assert longer.duration_s == 50.0
     assert longer.timeline == ()
-    held = derive_operating_conditions(longer)
-    assert [len(site.actors) for site in held.sites] == [1, 1, 0]
+    conditions = derive_operating_conditions(longer)
+    assert [len(site.actors) for site in conditions.sites] == [1, 1, 0]
     assert np.array_equal(
-        held.alpha,
+        conditions.alpha,
         derive_operating_conditions(load_scenario("training", {"duration_s": 5.0})).alpha,
     )
 

@@ -77,15 +77,15 @@ def test_llewellyns_parameter_is_at_most_minus_one() -> None:
 @given(seed=SEEDS)
 def test_for_two_ports_weights_match_llewellyn(seed: int) -> None:
     Y = drawn(seed, 2)
-    found = find_best_weights(Y, np.array([0, 1]))
+    weights = find_best_weights(Y, np.array([0, 1]))
     parameter = llewellyn_parameter(Y)
-    clear = np.abs(found.margin) > 1e-4
-    np.testing.assert_array_equal(found.margin[clear] > 0.0, parameter[clear] > 1.0)
+    clear = np.abs(weights.margin) > 1e-4
+    np.testing.assert_array_equal(weights.margin[clear] > 0.0, parameter[clear] > 1.0)
     # where both parts are alike: y12 beta_1 ~ y21 beta_2
     ratio = np.abs(Y[:, 0, 1]) / np.abs(Y[:, 1, 0])
-    np.testing.assert_allclose(found.weights[:, 0], 1.0)
-    plain = find_least_eigenvalue(weight_response(Y, found.weights))
-    np.testing.assert_array_equal(plain[clear] > 0.0, found.margin[clear] > 0.0)
+    np.testing.assert_allclose(weights.weights[:, 0], 1.0)
+    plain = find_least_eigenvalue(weight_response(Y, weights.weights))
+    np.testing.assert_array_equal(plain[clear] > 0.0, weights.margin[clear] > 0.0)
     assert np.isfinite(ratio).all()
 
 
@@ -126,7 +126,7 @@ def test_for_three_ports_weights_are_exact(seed: int) -> None:
 def test_no_weights_of_a_fine_grid_do_better(seed: int) -> None:
     Y = drawn(seed, 6, count=3)
     owner = np.array([0, 0, 1, 1, 2, 2])
-    found = find_best_weights(Y, owner)
+    weights = find_best_weights(Y, owner)
     size = np.ones((3, 6))
     for site in range(3):
         part = Y[:, owner == site][:, :, owner == site]
@@ -143,7 +143,7 @@ def test_no_weights_of_a_fine_grid_do_better(seed: int) -> None:
         ],
         axis=0,
     )
-    assert (found.margin >= best - 2e-3 * np.abs(found.margin)).all()
+    assert (weights.margin >= best - 2e-3 * np.abs(weights.margin)).all()
 
 
 def test_one_site_needs_no_weights() -> None:

@@ -19,11 +19,11 @@ def test_p_d_is_passive_once_stable(name: str, K: float) -> None:
     assert beyond.velocity.passive
     assert beyond.pole.passive
     assert not beyond.absolute.below
-    assert not any(one.minima.below for one in beyond.two_ports)
+    assert not any(two_port.minima.below for two_port in beyond.two_ports)
     below = section_of(name, (("control.K", K), ("control.d", 0.98 * line)))
     assert not below.velocity.passive
     assert below.absolute.below
-    assert all(one.minima.below for one in below.two_ports if len(below.sites) == 2)
+    assert all(two_port.minima.below for two_port in below.two_ports if len(below.sites) == 2)
 
 
 @pytest.mark.long
@@ -33,19 +33,23 @@ def test_criteria_agree_for_single_ports() -> None:
     for name, overrides in (("p_d_margin", ()), ("training", bare), ("two_sites", ())):
         section = section_of(name, overrides)
         assert section.verdict == "stable"
-        fails = [one for one in section.two_ports if one.minima.below and not one.clamped]
+        fails = [
+            two_port
+            for two_port in section.two_ports
+            if two_port.minima.below and not two_port.clamped
+        ]
         if not section.absolute.below:
             assert not fails
         if section.velocity.passive:
             assert not section.absolute.below
-            assert all(one.passive for one in section.joints.values())
+            assert all(joint.passive for joint in section.joints.values())
         worst = max((span.to_hz for span in section.velocity.minima.below), default=0.0)
         assert all(span.to_hz <= worst * 1.001 for span in section.absolute.below)
 
 
 def test_three_sites_pair_with_the_third_free() -> None:
     three = section_of("p_d_margin")
-    assert [(one.sites, one.clamped) for one in three.two_ports[::2]] == [
+    assert [(two_port.sites, two_port.clamped) for two_port in three.two_ports[::2]] == [
         (("m1", "m2"), ""),
         (("m1", "m2"), "s"),
         (("m1", "s"), ""),
@@ -53,10 +57,11 @@ def test_three_sites_pair_with_the_third_free() -> None:
         (("m2", "s"), ""),
         (("m2", "s"), "m1"),
     ]
-    assert {one.joint for one in three.two_ports} == {1, 2}
-    assert [(one.sites, one.clamped) for one in section_of("p_d_margin_two").two_ports] == 2 * [
-        (("m", "s"), "")
-    ]
+    assert {two_port.joint for two_port in three.two_ports} == {1, 2}
+    assert [
+        (two_port.sites, two_port.clamped)
+        for two_port in section_of("p_d_margin_two").two_ports
+    ] == 2 * [(("m", "s"), "")]
 
 
 def test_hands_feel_the_slave_by_default() -> None:

@@ -117,9 +117,9 @@ def test_winding_laws_lack_more_than_any_damper() -> None:
         A=A, B=loop.B[:, :1], C=loop.C[:1], inputs=("a.tau1",), outputs=("a.qd1",)
     )
     Y = build_admittance(wound)
-    found = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
-    assert not found.passive
-    assert found.lacking_nm_s_rad == np.inf
+    passivity = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
+    assert not passivity.passive
+    assert passivity.lacking_nm_s_rad == np.inf
 
 
 @given(

@@ -83,10 +83,10 @@ def test_no_frequencies_no_answers() -> None:
 
 def test_floating_networks_have_passive_poles_at_zero() -> None:
     floating = Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 7.0)))
-    found = find_pole_at_zero(floating.loop)
-    assert found.order == 1
-    assert found.passive
-    np.testing.assert_allclose(found.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
+    pole = find_pole_at_zero(floating.loop)
+    assert pole.order == 1
+    assert pole.passive
+    np.testing.assert_allclose(pole.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
     for tied in (floating._replace(k=(1.0, 0.0)), floating._replace(d=(1.0, 0.0)), pair()):
         none = find_pole_at_zero(tied.loop)
         assert none.order == 0
@@ -96,14 +96,14 @@ def test_floating_networks_have_passive_poles_at_zero() -> None:
 
 def test_uneven_floating_masses_have_an_active_pole() -> None:
     """7 N m/rad one way and 3 the other: the residue is no longer symmetric."""
-    found = find_pole_at_zero(
+    pole = find_pole_at_zero(
         Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 3.0))).loop
     )
-    assert found.order == 1
+    assert pole.order == 1
     np.testing.assert_allclose(
-        found.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9
+        pole.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9
     )
-    assert not found.passive
+    assert not pole.passive
 
 
 def test_following_floating_angles_gives_third_order_poles() -> None:
@@ -111,9 +111,9 @@ def test_following_floating_angles_gives_third_order_poles() -> None:
     loop = Network((1.0, 1.0), (0.0, 0.0), (0.0, 0.0)).loop
     A = loop.A.copy()
     A[1, 2] = 5.0
-    found = find_pole_at_zero(loop._replace(A=A))
-    assert found.order == 3
-    assert not found.passive
+    pole = find_pole_at_zero(loop._replace(A=A))
+    assert pole.order == 3
+    assert not pole.passive
 
 
 def test_ports_by_site_and_by_joint() -> None:
@@ -176,14 +176,14 @@ def test_the_width_is_a_ratio_in_db(
     free: float, clamped: float, band: tuple[float, float]
 ) -> None:
     w = 2.0 * np.pi * np.union1d(np.geomspace(0.01, 100.0, 401), band)
-    one = Transparency(
+    transparency = Transparency(
         "a", "b", 1, w, to_imaginary_axis(free * w), to_imaginary_axis(clamped * w), band
     )
-    assert one.ratio_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
+    assert transparency.ratio_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
     middle_rad_s = 2.0 * np.pi * np.sqrt(band[0] * band[1])
-    assert one.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
-    assert one.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
-    assert one.interpolate_magnitudes(1.0) == pytest.approx(
+    assert transparency.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
+    assert transparency.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
+    assert transparency.interpolate_magnitudes(1.0) == pytest.approx(
         (2.0 * np.pi * free, 2.0 * np.pi * clamped), rel=1e-6
     )
 

@@ -174,8 +174,8 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
         rates = np.block(
             [[none, one, none], [-hand * inverse, none, inverse], [none, none, none]]
         )
-        made = expm(H_S * rates)
-        step[site] = made[:12, :12], made[:12, 12:]
+        exponential = expm(H_S * rates)
+        step[site] = exponential[:12, :12], exponential[:12, 12:]
     size = 24 + 12 * DELAY_TICKS  # m, s, then (q_m, q_s) of the ticks before, latest first
     A = np.zeros((size, size))
     law = np.hstack([-np.diag(STIFF), -np.diag(DAMPING)])

@@ -48,9 +48,9 @@ SETTLED_S = {
     ],
 )
 def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
-    made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
-    made.advance_to(30.0)
-    assert made.settled_s == printed(settled_s, 0.1)
+    fused_run = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
+    fused_run.advance_to(30.0)
+    assert fused_run.settled_s == printed(settled_s, 0.1)
 
 
 @pytest.mark.long
@@ -74,9 +74,9 @@ def test_free_motions_error_grows_with_delay() -> None:
 def test_about_one_rest_some_delay_damps_common_motion(
     delay_ms: float, rate_per_s: float
 ) -> None:
-    found = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
-    assert found.decisive.rightmost is not None
-    assert found.decisive.rightmost.s.real == printed(rate_per_s, 0.001)
+    analysis = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
+    assert analysis.decisive.rightmost is not None
+    assert analysis.decisive.rightmost.s.real == printed(rate_per_s, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -352,6 +352,6 @@ def test_play_out_makes_the_jittered_run_diverge() -> None:
 def test_order_makes_jitter_exceed_its_limits(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
-    made = FusedRun(load_scenario("jitter", changes))
-    made.advance_to(40.0)
-    assert (made.diverged_s is not None) is leaves
+    fused_run = FusedRun(load_scenario("jitter", changes))
+    fused_run.advance_to(40.0)
+    assert (fused_run.diverged_s is not None) is leaves

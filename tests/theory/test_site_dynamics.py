@@ -73,7 +73,7 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     one = site(rng, law, actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
-    found, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
+    site_rates, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
     for name, value in wanted.items():
         scale = 1.0 + max(
             np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()
@@ -83,7 +83,7 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
             if name == "qdd"
             else 1.0
         )
-        assert np.abs(getattr(found, name) - value).max() <= 1e-12 * scale * max(
+        assert np.abs(getattr(site_rates, name) - value).max() <= 1e-12 * scale * max(
             1.0, inverse
         ), name
 
@@ -96,17 +96,17 @@ def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     one = site(rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL])
     x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
-    found = differentiate_site_rates(one, x)
+    derivatives = differentiate_site_rates(one, x)
     for k in range(AT.arguments):
         ahead, behind = (
             evaluate_site_rates(one, x + sign * step * np.eye(AT.arguments)[k])
             for sign in (1, -1)
         )
-        for name in found._fields:
+        for name in derivatives._fields:
             difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
-            exact = getattr(found, name)[:, k]
+            exact = getattr(derivatives, name)[:, k]
             assert np.abs(difference - exact).max() <= 1e-6 * (
-                1.0 + np.abs(getattr(found, name)).max()
+                1.0 + np.abs(getattr(derivatives, name)).max()
             )
 
 

@@ -160,12 +160,12 @@ def test_heavy_slaves_exceed_both_frequency_limits() -> None:
     """
     K, M_s, d_s, T = 142.0, 0.0512, 4.3, 4.16e-3
     w = reflection_frequencies(K, d_s, T)
-    asked = reflection_damping(w, K, M_s, d_s, T)
-    edge = float(asked.max())
+    damping = reflection_damping(w, K, M_s, d_s, T)
+    edge = float(damping.max())
     slow, fast = (2.0 * K * T + d_s) ** 2 / (4.0 * d_s), K * M_s / d_s
     enough = K * (2.0 * M_s + T * d_s) ** 2 / (4.0 * M_s * d_s)
     assert (edge, slow, fast, enough) == pytest.approx((1.943, 1.747, 1.691, 2.333), abs=5e-4)
-    assert w[asked.argmax()] == pytest.approx(69.0, abs=0.1)
+    assert w[damping.argmax()] == pytest.approx(69.0, abs=0.1)
     for k_f in (1.0, 0.3):
         wires = (Wire(0, 1, 0.0, 0.0, T, k_f), Wire(1, 0, K, 0.0, T))
         for part, fails in ((0.99, True), (1.01, False)):

@@ -82,8 +82,10 @@ STOPS = {"stop_stiffness": 200.0, "stop_damping": 2.0}
 def chain(name: str, gravity: Array, **drive: float) -> ChainSetup:
     read = REFERENCES[name].chain
     joints = [
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
-        for one in read.joints
+        ChainJoint(
+            joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
+        )
+        for joint in read.joints
     ]
     return ChainSetup(tuple(joints), tuple(gravity), read.tip_origin_m)
 

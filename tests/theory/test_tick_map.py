@@ -27,9 +27,9 @@ def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
     """Returns the continuous and the sampled spectrum, about one pose."""
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
-    found = compute_sampled_spectrum(now, rest, wanted)
-    assert found is not None
-    return continuous, found
+    spectrum = compute_sampled_spectrum(now, rest, wanted)
+    assert spectrum is not None
+    return continuous, spectrum
 
 
 HANDS = [
@@ -181,9 +181,9 @@ def test_a_growing_swing_matches_a_run() -> None:
         },
     )
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3005, 0.0))
-    found = compute_sampled_spectrum(now, rest, 2)
-    assert found is not None
-    root = found.roots[0].s
+    spectrum = compute_sampled_spectrum(now, rest, 2)
+    assert spectrum is not None
+    root = spectrum.roots[0].s
     run = trajectories(scenario).sites["m"]
     late = run.t_s > 8.0
     apart = np.abs(run.q - run.q_des)[late, 0]

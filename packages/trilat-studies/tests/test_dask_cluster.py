@@ -215,13 +215,16 @@ def test_a_worker_without_the_laws_file_is_refused(
 
 
 def test_differences_are_named_on_both_sides() -> None:
-    here = describe_worker()
-    assert explain_unfit_worker(WorkerRequirements(here), here, []) == ""
+    worker = describe_worker()
+    assert explain_unfit_worker(WorkerRequirements(worker), worker, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
-        text = explain_unfit_worker(WorkerRequirements(here), {**here, name: "other"}, [])
-        assert f"has {name} other, but the study needs {name} {here[name]}" in text
-    assert explain_unfit_worker(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
-    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(here), here, ["a.b:Law"])
+        text = explain_unfit_worker(WorkerRequirements(worker), {**worker, name: "other"}, [])
+        assert f"has {name} other, but the study needs {name} {worker[name]}" in text
+    assert (
+        explain_unfit_worker(WorkerRequirements(worker), {**worker, "commit": "other"}, [])
+        == ""
+    )
+    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(worker), worker, ["a.b:Law"])
 
 
 @pytest.mark.long

@@ -91,9 +91,9 @@ def test_only_segments_with_active_sines_count(spring: HandImpedance) -> None:
         SPRING,
         *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"]),
     ]
-    found = identify_hand(tn.simulate("free", changes))
-    assert found.segments == spring.segments
-    assert np.allclose(found.K, spring.K, atol=1e-6)
+    identified_hand = identify_hand(tn.simulate("free", changes))
+    assert identified_hand.segments == spring.segments
+    assert np.allclose(identified_hand.K, spring.K, atol=1e-6)
 
 
 def test_an_identified_hand_works_in_a_scenario(spring: HandImpedance) -> None:
@@ -116,7 +116,7 @@ def test_mass_behind_own_motion_is_identified_over_networks() -> None:
     true, found = held(3, 40.0)
     assert covered(true, found).mean() >= 0.75
     assert np.allclose(found.M, true.M, atol=0.2)
-    assert {len(one) for one in dataclasses.asdict(found)["halves"].values()} == {2}
+    assert {len(half) for half in dataclasses.asdict(found)["halves"].values()} == {2}
 
 
 @pytest.mark.long

@@ -78,10 +78,12 @@ def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:
 
 def test_trial_of_distribution_names_its_repeating_command(file: Path) -> None:
     trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
-    words = shlex.split(trial.look)
-    settings = [words[n + 1] for n, word in enumerate(words) if word == "--set"]
+    arguments = shlex.split(trial.look)
+    settings = [arguments[n + 1] for n, word in enumerate(arguments) if word == "--set"]
     assert (
-        load_scenario(words[2], [*settings, f"seed={words[words.index('--seed') + 1]}"])
+        load_scenario(
+            arguments[2], [*settings, f"seed={arguments[arguments.index('--seed') + 1]}"]
+        )
         == trial.scenario
     )
     assert len(set(trial.scenario.sites["m"].control.d)) == 2
@@ -122,13 +124,13 @@ def test_the_outcome_of_a_candidate_is_its_worst() -> None:
     diverged = msgspec.structs.replace(
         settled, outcome=CandidateClass.DIVERGED, error_rad=None, diverged_s=1.0
     )
-    found = average_scores([settled, diverged])
-    assert (found.outcome, found.error_rad, found.diverged_s) == (
+    score = average_scores([settled, diverged])
+    assert (score.outcome, score.error_rad, score.diverged_s) == (
         CandidateClass.DIVERGED,
         None,
         1.0,
     )
-    assert found.effort_nm == 2.0
+    assert score.effort_nm == 2.0
 
 
 def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
@@ -140,9 +142,9 @@ def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
         "sim", file.name, "--set", "link.delay_ms=60", "-o", "4.mcap", cwd=file.parent
     ).succeeds()
     text = trilat("compare", "1.mcap", "2.mcap", "3.mcap", "--json", cwd=file.parent).succeeds()
-    found = json.loads(text)
-    row = next(row for row in found["rows"] if row["key"] == "rms_error_rad")
-    assert found["means"]["rms_error_rad"] == mean_interval(row["values"])._asdict()
+    facts = json.loads(text)
+    row = next(row for row in facts["rows"] if row["key"] == "rms_error_rad")
+    assert facts["means"]["rms_error_rad"] == mean_interval(row["values"])._asdict()
     assert "means" not in json.loads(
         trilat("compare", "1.mcap", "4.mcap", "--json", cwd=file.parent).succeeds()
     )

@@ -78,9 +78,9 @@ def test_invalid_ranges_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 def test_users_laws_are_tuned_like_built_in_ones(tmp_path: Path) -> None:
     """The user's law computes p_d, so both laws get the same numbers."""
-    found = tn.tune("free", [CompiledPD, "p_d"], budget=2, duration_s=2, jobs=1)
-    ours, theirs = (one.scores for one in found.found)
-    assert found.found[0].space.law == "tests.own_laws:CompiledPD"
+    tuning = tn.tune("free", [CompiledPD, "p_d"], budget=2, duration_s=2, jobs=1)
+    ours, theirs = (one.scores for one in tuning.found)
+    assert tuning.found[0].space.law == "tests.own_laws:CompiledPD"
     assert all(score.error_rad is not None for score in [*ours, *theirs])
     swept = tn.sweep(
         "p_d_margin",

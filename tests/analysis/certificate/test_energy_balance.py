@@ -296,12 +296,12 @@ def unexplained(balance: EnergyBalance) -> float:
 def check_six(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joints(duration_s, 200.0)))
-    found, metrics = certify(log), compute_log_metrics(log)
-    assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
-    assert found.balance is not None
-    assert unexplained(found.balance) <= BAR
-    assert np.abs(found.balance.residual).max() <= BAR * found.balance.V.max()
-    for site, energy in found.energies.items():
+    certificate, metrics = certify(log), compute_log_metrics(log)
+    assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
+    assert certificate.balance is not None
+    assert unexplained(certificate.balance) <= BAR
+    assert np.abs(certificate.balance.residual).max() <= BAR * certificate.balance.V.max()
+    for site, energy in certificate.energies.items():
         own = metrics.sites[site]
         learnt = own["theta_energy_last_j"].value - own["theta_energy_first_j"].value
         assert learnt == pytest.approx(
@@ -342,16 +342,17 @@ def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
 
 
 def test_premises_name_joints_at_limits_and_at_stops() -> None:
-    found = certify(rough_log())
-    premises = {premise.name: premise for premise in found.premises}
+    certificate = certify(rough_log())
+    premises = {premise.name: premise for premise in certificate.premises}
     assert (
         premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
     )
     assert "s (shoulder_lift)" in premises["torque"].text
     assert "m2 (elbow)" in premises["stops"].text
-    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE), (
-        found.verdict.text
-    )
+    assert certificate.verdict.finding in (
+        StabilityFinding.DID_NOT_RISE,
+        StabilityFinding.ROSE,
+    ), certificate.verdict.text
 
 
 def test_every_term_of_a_rough_arm_is_needed() -> None:
@@ -371,13 +372,13 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
 
 
 def test_friction_and_stops_stand_in_arm_energies() -> None:
-    found = compute_log_metrics(rough_log())
-    for own in found.sites.values():
-        assert own["friction_j"].value > 1.0
-        assert own["unaccounted_j"].value <= 0.02
-    assert found.sites["m2"]["walls_j"].value < 0.0  # its stop
-    assert not found.sites["m1"]["walls_j"].applies
-    assert found.walls["s/1"]["force_peak_n"].value > 10.0
+    metrics = compute_log_metrics(rough_log())
+    for site in metrics.sites.values():
+        assert site["friction_j"].value > 1.0
+        assert site["unaccounted_j"].value <= 0.02
+    assert metrics.sites["m2"]["walls_j"].value < 0.0  # its stop
+    assert not metrics.sites["m1"]["walls_j"].applies
+    assert metrics.walls["s/1"]["force_peak_n"].value > 10.0
 
 
 """Largest residual as a share of the largest V."""
@@ -433,11 +434,11 @@ def test_the_axis_of_one_arm_dissipates() -> None:
     log = trilat_net.simulate(
         load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0})
     )
-    found = certify(log)
-    assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
-    assert share(found) <= BAR
-    assert found.balance is not None
-    taken = found.balance.dissipation["open axes"]
+    certificate = certify(log)
+    assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
+    assert share(certificate) <= BAR
+    assert certificate.balance is not None
+    taken = certificate.balance.dissipation["open axes"]
     assert taken[-1] > 1e-3
     assert np.diff(taken).min() >= -1e-15
     for site, energy in compute_site_energies(log).items():

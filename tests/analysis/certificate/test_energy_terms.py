@@ -96,10 +96,10 @@ def test_jumps_of_links_change_v_exactly(
     place of m'.
     """
     jumped = Situation(seed, before, after)
-    kept = Situation(seed, before, (before[0] + 1, before[1] + 1))
-    change = jumped.v(1) - kept.v(1)
+    situation = Situation(seed, before, (before[0] + 1, before[1] + 1))
+    change = jumped.v(1) - situation.v(1)
     assert sum(jumped.booked()) == pytest.approx(change, rel=1e-9, abs=1e-9)
-    assert kept.booked() == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert situation.booked() == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
 @settings(max_examples=30)
@@ -155,9 +155,9 @@ def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
     peer.qd[:], peer.q[:] = speed, speed * t_s[:, np.newaxis]
     peer = peer._replace(rate_hz=RATE_HZ)
     grown_s = 1e-6
-    one = view_delayed_peer(site.track, PeerTrajectory(peer))
-    later = PeerTrajectory(peer).evaluate(one.stamp_s - np.array([0.0, grown_s]))
-    site.views[0] = one._replace(delayed=later)
+    peer_view = view_delayed_peer(site.track, PeerTrajectory(peer))
+    later = PeerTrajectory(peer).evaluate(peer_view.stamp_s - np.array([0.0, grown_s]))
+    site.views[0] = peer_view._replace(delayed=later)
     site.track.q_des[1] = sum(
         a * v.delayed.q[1] for a, v in zip(site.alpha, site.views, strict=True)
     )

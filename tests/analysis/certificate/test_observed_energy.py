@@ -71,12 +71,12 @@ def test_a_line_at_rest_is_a_spring() -> None:
     force squared times T / b.
     """
     log = clamped()
-    found = observe_energies(log, own_laws=True)
-    assert found.finding is ObservedFinding.PASSIVE
-    assert all(premise.holds for premise in found.premises)
-    assert {one.name for one in found.least} >= {"line m->s", "line s->m"}
-    assert min(one.amount_j for one in found.least) >= -1e-12
-    assert found.residual_j <= 1e-12 * found.largest_j
+    energies = observe_energies(log, own_laws=True)
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in energies.premises)
+    assert {one.name for one in energies.least} >= {"line m->s", "line s->m"}
+    assert min(one.amount_j for one in energies.least) >= -1e-12
+    assert energies.residual_j <= 1e-12 * energies.largest_j
     force = TO / (1 / HAND + DELAY_S / B + 1 / WALL)  # of each of two joints
     assert log["m"].tau_x[-1] == pytest.approx([-force, -force], rel=2e-3)
     waves = [log[site].sent[f"u[{peer}]"][-1] for site, peer in (("m", "s"), ("s", "m"))]
@@ -92,9 +92,9 @@ def test_waves_held_over_an_outage_add_energy() -> None:
     """
     outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
     log = clamped.__wrapped__(**outage, duration_s=3.2)
-    found = certify(log, own_laws=True)
-    assert found.observed.finding is ObservedFinding.NEGATIVE
-    lowest = min(found.observed.least, key=lambda one: one.amount_j)
+    certificate = certify(log, own_laws=True)
+    assert certificate.observed.finding is ObservedFinding.NEGATIVE
+    lowest = min(certificate.observed.least, key=lambda one: one.amount_j)
     assert lowest.name == "line m->s"
     last = round(1000 * lowest.at_s) + 1
     used = log["s"].used["m"][:last]
@@ -102,14 +102,14 @@ def test_waves_held_over_an_outage_add_energy() -> None:
     energy = 0.5 * 1e-3 * (log["m"].sent["u[s]"][:last] ** 2).sum(axis=1)
     assert times.max() > 1000
     assert lowest.amount_j == pytest.approx(((1 - times) * energy).sum(), rel=1e-9)
-    assert found.observed.text in found.reasons
-    assert found.stability is not Stability.STABLE
+    assert certificate.observed.text in certificate.reasons
+    assert certificate.stability is not Stability.STABLE
 
 
 def test_books_detect_a_law_sending_too_much() -> None:
-    found = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
-    assert found.finding is ObservedFinding.BROKEN
-    assert found.residual_j > 1e-4
+    energies = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
+    assert energies.finding is ObservedFinding.BROKEN
+    assert energies.residual_j > 1e-4
 
 
 def test_code_from_outside_runs_only_on_request() -> None:
@@ -121,12 +121,12 @@ def test_code_from_outside_runs_only_on_request() -> None:
 
 
 def test_the_certificate_reports_it_in_text_and_json() -> None:
-    found = certify(clamped(), own_laws=True)
-    lines = {line.text: line.mark for line in describe_certificate(found)}
-    assert lines[found.observed.text] == "ok"
-    told = found.to_dict()["observed"]
+    certificate = certify(clamped(), own_laws=True)
+    lines = {line.text: line.mark for line in describe_certificate(certificate)}
+    assert lines[certificate.observed.text] == "ok"
+    told = certificate.to_dict()["observed"]
     assert told["finding"] == "passive"
-    assert {one["name"] for one in told["premises"]} == {"books", "torque", "sampling"}
+    assert {premise["name"] for premise in told["premises"]} == {"books", "torque", "sampling"}
     assert np.isfinite([one["amount_j"] for one in told["least"]]).all()
 
 
@@ -140,17 +140,17 @@ def run(law: str) -> Log:
 @pytest.mark.parametrize("law", LAWS)
 def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> None:
     log = run(law)
-    found = observe_energies(log)
-    assert found.finding is ObservedFinding.PASSIVE
-    assert all(premise.holds for premise in found.premises)
-    assert found.residual_j <= 1e-12 * found.largest_j
-    assert {one.name for one in found.least} >= {
+    energies = observe_energies(log)
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in energies.premises)
+    assert energies.residual_j <= 1e-12 * energies.largest_j
+    assert {one.name for one in energies.least} >= {
         "line m->s",
         "line s->m",
         "store of s",
         "taken by s",
     }
-    given = next(one for one in found.curves if one.name == "given by m")
+    given = next(curve for curve in energies.curves if curve.name == "given by m")
     work = -(log["m"].tau[:-1] * np.diff(log["m"].q, axis=0)).sum()
     assert given.energy_j[-1] == pytest.approx(work, rel=1e-9)
     assert work > 0.05
@@ -176,14 +176,14 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
     changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
     covered = certify(simulate_scenario(load_scenario("two_sites", changes)))
     assert covered.observed.finding is ObservedFinding.PASSIVE
-    found = certify(
+    certificate = certify(
         simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
     )
-    assert found.observed.finding is ObservedFinding.NEGATIVE
-    assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(found)
-    known = next(one for one in found.observed.least if one.name == "known at s of m")
+    assert certificate.observed.finding is ObservedFinding.NEGATIVE
+    assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(certificate)
+    known = next(one for one in certificate.observed.least if one.name == "known at s of m")
     assert known.amount_j < -1e-7
-    assert found.observed.text in found.reasons
+    assert certificate.observed.text in certificate.reasons
 
 
 @pytest.mark.long
@@ -191,9 +191,9 @@ def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
     """As published: the follower's damper uses a velocity with which the follower is not moved."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
-    found = observe_energies(log)
-    taken = next(one for one in found.least if one.name == "taken by s")
-    assert found.finding is ObservedFinding.NEGATIVE
+    energies = observe_energies(log)
+    taken = next(one for one in energies.least if one.name == "taken by s")
+    assert energies.finding is ObservedFinding.NEGATIVE
     assert taken.amount_j < -1e-3
 
 
@@ -203,11 +203,11 @@ def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
     log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
-    found = observe_energies(log)
-    assert found.finding is ObservedFinding.PASSIVE
-    assert next(one for one in found.premises if one.name == "torque").text.startswith(
-        "cut off at m"
-    )
+    energies = observe_energies(log)
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert next(
+        premise for premise in energies.premises if premise.name == "torque"
+    ).text.startswith("cut off at m")
     assert np.abs(log["m"].tau).max() == 1.5
 
 
@@ -231,9 +231,9 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
     for name, beta in (("m2", 0.5), ("s", 1.5)):
         sites[name]["control"] = {**control, "beta": beta}
     scenario = unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
-    found = observe_energies(simulate_scenario(scenario))
-    assert found.finding is ObservedFinding.PASSIVE
-    assert all(premise.holds for premise in found.premises)
+    energies = observe_energies(simulate_scenario(scenario))
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in energies.premises)
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 4])

@@ -192,11 +192,11 @@ def test_sampled_walls_give_half_k_dx_squared() -> None:
     # the spring is there, and nobody pressed it
     enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)
     gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
-    found = find_wall_energies(log)[0]
-    assert found.site == "s"
-    assert found.generated_j == pytest.approx(gives, rel=0.02)
-    assert found.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
-    assert found.arm_damping_n_s_m == 0.0
+    wall_energy = find_wall_energies(log)[0]
+    assert wall_energy.site == "s"
+    assert wall_energy.generated_j == pytest.approx(gives, rel=0.02)
+    assert wall_energy.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
+    assert wall_energy.arm_damping_n_s_m == 0.0
 
 
 def test_the_sampled_wall_fails_its_premise_by_name() -> None:

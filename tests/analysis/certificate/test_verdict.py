@@ -323,9 +323,9 @@ def test_only_recorded_periods_count_for_v() -> None:
 
 
 def test_no_option_accepts_a_changed_log() -> None:
-    taken = taken_apart(recorded("free", RUN))
-    taken.metadata("trilat.session")["seed"] += "0"
-    certificate = found(taken.bytes())
+    pieces = taken_apart(recorded("free", RUN))
+    pieces.metadata("trilat.session")["seed"] += "0"
+    certificate = found(pieces.bytes())
     assert any("changed since it was made" in why for why in certificate.reasons)
     assert not certificate.accepts(("bounded", "open"))
 

@@ -36,26 +36,26 @@ def test_a_known_filter_is_identified() -> None:
     """Gain and phase of a known system, by SciPy's freqz."""
     b, a = signal.butter(1, 3.0, fs=RATE_HZ)
     x = noise(1)
-    found = strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
-    _, H = signal.freqz(b, a, worN=[found.frequency_hz], fs=RATE_HZ)
-    assert found.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * found.error))
-    assert found.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
-    assert found.coherence > 0.95
+    response = strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
+    _, H = signal.freqz(b, a, worN=[response.frequency_hz], fs=RATE_HZ)
+    assert response.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * response.error))
+    assert response.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
+    assert response.coherence > 0.95
 
 
 def test_unrelated_signals_are_undecided() -> None:
     x = noise(1)
-    found = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
-    assert found.gain is None
-    assert "the coherence" in found.why
+    response = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
+    assert response.gain is None
+    assert "the coherence" in response.why
 
 
 def test_one_push_is_not_enough() -> None:
     """A single event is coherent with anything."""
     x = np.where(np.abs(np.arange(len(EVERYTHING)) - 2000) < 100, 1.0, 0.0)
-    found = strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
-    assert found.gain is None
-    assert "stretches of 4 s" in found.why
+    response = strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
+    assert response.gain is None
+    assert "stretches of 4 s" in response.why
 
 
 def test_weak_drives_and_missing_records_are_named() -> None:
@@ -116,9 +116,9 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
     log = simulated("two_sites", shaken())
     (found,) = (
-        one
-        for one in compute_log_metrics(log).responses
-        if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+        response
+        for response in compute_log_metrics(log).responses
+        if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
     assert found.ratio.frequency_hz == 1.0
     s = 2j * math.pi
@@ -134,8 +134,8 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
 
 def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
-    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
-    for one in found:
+    responses = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
+    for one in responses:
         if one.kind == "impedance":
             assert one.ratio.gain is None
 
@@ -165,7 +165,9 @@ def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines:
     """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
     log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
     found = next(
-        one for one in compute_log_metrics(log).responses if (one.at, one.joint) == ("m", 1)
+        response
+        for response in compute_log_metrics(log).responses
+        if (response.at, response.joint) == ("m", 1)
     )
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
     assert len(found.spectrum) == lines

@@ -66,8 +66,8 @@ def test_duplicate_keys_are_refused_with_both_files() -> None:
 @pytest.mark.parametrize("name", ["free", "contact"])
 def test_a_measure_gives_its_declared_quantities(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
-    for one in list_measures():
-        for place in view.list_subjects(one.of):
-            assert set(one.measure(view, place)) == {
-                quantity.key for quantity in one.quantities
+    for measure in list_measures():
+        for subject in view.list_subjects(measure.of):
+            assert set(measure.measure(view, subject)) == {
+                quantity.key for quantity in measure.quantities
             }

@@ -37,13 +37,13 @@ def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
     rests = []
     for rate_hz in (100, 200):
         log = simulated("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme})
-        found = compute_log_metrics(log).sites
+        sites = compute_log_metrics(log).sites
         for site in log.sites:
             change = _mechanical(log, site)
-            assert found[site]["mechanical_j"].value == pytest.approx(
+            assert sites[site]["mechanical_j"].value == pytest.approx(
                 change[-1] - change[0], abs=1e-9
             )
-        rests.append(found["m1"]["unaccounted_j"].value)
+        rests.append(sites["m1"]["unaccounted_j"].value)
     assert rests[0] < 1e-3
     assert math.log2(rests[0] / rests[1]) == pytest.approx(2.0, abs=0.3)
 
@@ -139,7 +139,7 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
 def test_delay_energy_is_the_ports_excess(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
     log = simulated("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law})
-    found, largest = compute_log_metrics(log), 0.0
+    metrics, largest = compute_log_metrics(log), 0.0
     for site in log.sites:
         part, spec = log[site], log.scenario.sites[site]
         shares = log.scenario.dominance[site]
@@ -151,9 +151,9 @@ def test_delay_energy_is_the_ports_excess(law: str) -> None:
         torque = LAWS[law](spec, part, e, ed)
         prompt = float(np.trapezoid((torque * part.qd).sum(axis=1), part.t_s))
         late = sum(
-            found.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer]
+            metrics.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer]
         )
-        given = found.sites[site]["controller_j"].value
+        given = metrics.sites[site]["controller_j"].value
         scale = float(np.trapezoid(np.abs((torque * part.qd).sum(axis=1)), part.t_s))
         assert prompt + late == pytest.approx(given, abs=2e-4 * scale)
         largest = max(largest, abs(late) / scale)

@@ -65,15 +65,15 @@ def prescribed(ramp_s: float = 0.5, steps: Mapping[int, float] | None = None) ->
 
 def test_effort_of_a_hand_counts_by_its_share() -> None:
     """|tau|^2 is 13 and 2; the shares of m1 add up to 200 x 0.75 + (75 - 0.5 x 49.5) + 100 x 0.25."""
-    found = compute_log_metrics(prescribed())
+    metrics = compute_log_metrics(prescribed())
     shares = 150.0 + 50.25 + 25.0
-    assert found.sites["m1"]["authority_effort_nm2_s"].value == pytest.approx(
+    assert metrics.sites["m1"]["authority_effort_nm2_s"].value == pytest.approx(
         13.0 * shares / 200.0
     )
-    assert found.sites["m2"]["authority_effort_nm2_s"].value == pytest.approx(
+    assert metrics.sites["m2"]["authority_effort_nm2_s"].value == pytest.approx(
         2.0 * (400.0 - shares) / 200.0
     )
-    assert not found.sites["s"]["authority_effort_nm2_s"].applies
+    assert not metrics.sites["s"]["authority_effort_nm2_s"].applies
 
 
 def test_the_smaller_of_opposed_torques_cancels() -> None:
@@ -97,8 +97,8 @@ def test_three_users_cancel_except_the_remaining_torque() -> None:
 
 def test_a_takeover_lasts_until_the_larger_share() -> None:
     """The ramp of 0.5 s passes 1/2 at 1.25 s: ticks 0 to 249 of 400 are m1's; at equal shares m2 leads."""
-    found = measure_run(prescribed(), ["intervention_share", "takeovers", "takeover_s"])
-    assert {key: one.value for key, one in found.items()} == {
+    run = measure_run(prescribed(), ["intervention_share", "takeovers", "takeover_s"])
+    assert {key: one.value for key, one in run.items()} == {
         "intervention_share": pytest.approx(250.0 / 400.0),
         "takeovers": 1.0,
         "takeover_s": pytest.approx(0.25, abs=1e-9),
@@ -151,10 +151,10 @@ def test_shares_are_identified_from_motion() -> None:
         first, second = (np.array(rates[peer](state.used[peer])) for peer in ("m1", "m2"))
         return msgspec.structs.replace(state, qd=(0.6 * first + 0.4 * second).tolist())
 
-    found = compute_log_metrics(rewritten(prescribed(), change=change))
-    assert found.sites["m1"]["motion_share"].value == pytest.approx(0.6)
-    assert found.sites["m2"]["motion_share"].value == pytest.approx(0.4)
-    assert not found.sites["s"]["motion_share"].applies
+    metrics = compute_log_metrics(rewritten(prescribed(), change=change))
+    assert metrics.sites["m1"]["motion_share"].value == pytest.approx(0.6)
+    assert metrics.sites["m2"]["motion_share"].value == pytest.approx(0.4)
+    assert not metrics.sites["s"]["motion_share"].applies
 
 
 def test_users_moving_alike_are_not_separated() -> None:
@@ -172,5 +172,5 @@ def test_contradictory_motion_of_the_slave_has_no_shares() -> None:
         moves = {"m1": [1.0, 0.0], "m2": [0.0, 1.0], "s": [5.0 * sign, 0.0]}
         return msgspec.structs.replace(state, qd=moves[state.site])
 
-    found = compute_log_metrics(rewritten(prescribed(), change=change))
-    assert "does not determine" in found.sites["m1"]["motion_share"].why
+    metrics = compute_log_metrics(rewritten(prescribed(), change=change))
+    assert "does not determine" in metrics.sites["m1"]["motion_share"].why

@@ -192,8 +192,8 @@ def test_the_past_is_given_as_far_as_played(log_file: Path) -> None:
 
     def ask() -> None:
         for first, last in ((0, 9), (40, 1000), (290, 299)):
-            wanted = BackfillRequest(channel="state", first=first, last=last)
-            rings.append(hall.ask("m2", topics.PAST, encode(wanted)))
+            backfill_request = BackfillRequest(channel="state", first=first, last=last)
+            rings.append(hall.ask("m2", topics.PAST, encode(backfill_request)))
         rings.append(
             hall.ask(
                 "s", topics.PAST, encode(BackfillRequest(channel="link", first=0, last=99))

@@ -66,9 +66,9 @@ def test_without_gaps_answers_equal_a_sites(
     for number in range(count):
         ring.store(number.to_bytes(2, "big") * size)
     memory = remembered(list(range(count)), count, size)
-    told = memory.find_messages(CHANNEL, first, first + more)
-    assert told == ring.read_chunk(first, first + more)
-    assert sum(map(len, told[1])) <= BACKFILL_BYTES
+    messages = memory.find_messages(CHANNEL, first, first + more)
+    assert messages == ring.read_chunk(first, first + more)
+    assert sum(map(len, messages[1])) <= BACKFILL_BYTES
 
 
 def test_unplayed_messages_are_not_sent() -> None:

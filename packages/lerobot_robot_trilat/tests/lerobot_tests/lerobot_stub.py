@@ -104,7 +104,9 @@ def plugins() -> Iterator[dict[str, ModuleType]]:
     finally:
         del sys.path[: len(names)]
         for name in [
-            one for one in sys.modules if one not in before and one.startswith("lerobot")
+            module
+            for module in sys.modules
+            if module not in before and module.startswith("lerobot")
         ]:
             del sys.modules[name]
 

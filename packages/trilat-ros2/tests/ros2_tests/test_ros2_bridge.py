@@ -315,14 +315,14 @@ class Listener:
 
 def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
     found = {"world": (np.zeros(3), Rotation.identity())}
-    for one in frames:
+    for frame in frames:
         (at, turned), move, turn = (
-            found[one.header.frame_id],
-            one.transform.translation,
-            one.transform.rotation,
+            found[frame.header.frame_id],
+            frame.transform.translation,
+            frame.transform.rotation,
         )
         place = at + turned.apply([move.x, move.y, move.z])
-        found[one.child_frame_id] = (
+        found[frame.child_frame_id] = (
             place,
             turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]),
         )
@@ -346,8 +346,8 @@ def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
     for site in log.sites:
         graph = Listener()
         ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
-        shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
-        shown.publish(log[site].states[-1], 1000.0)
+        site_topics = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+        site_topics.publish(log[site].states[-1], 1000.0)
         messages = [
             ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]
         ]
@@ -356,14 +356,19 @@ def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
             graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped"
         )
         where, turn = tip.pose.position, tip.pose.orientation
-        held = next(
-            one for one in frames if one.child_frame_id == tip.header.frame_id
+        transform = next(
+            frame for frame in frames if frame.child_frame_id == tip.header.frame_id
         ).transform
         base = Rotation.from_quat(
-            [held.rotation.x, held.rotation.y, held.rotation.z, held.rotation.w]
+            [
+                transform.rotation.x,
+                transform.rotation.y,
+                transform.rotation.z,
+                transform.rotation.w,
+            ]
         )
         place = base.apply([where.x, where.y, where.z])
-        place += [held.translation.x, held.translation.y, held.translation.z]
+        place += [transform.translation.x, transform.translation.y, transform.translation.z]
         turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
         apart = [
             max(np.abs(at - place).max(), (way.inv() * turned).magnitude())
@@ -727,11 +732,11 @@ def list_bag(path: Path) -> dict[str, tuple[str, bool]]:
     """Returns, for every topic of a bag as rosbags reads it, the type and whether the topic is latched."""
     with Reader(path) as bag:
         return {
-            one.topic.removeprefix("/"): (
-                one.msgtype,
-                one.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL",  # type: ignore[union-attr]
+            connection.topic.removeprefix("/"): (
+                connection.msgtype,
+                connection.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL",  # type: ignore[union-attr]
             )
-            for one in bag.connections
+            for connection in bag.connections
         }
 
 

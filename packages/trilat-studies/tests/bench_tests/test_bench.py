@@ -124,8 +124,8 @@ def test_the_executor_of_the_cells_changes_no_result(
     whole: BenchResults, tmp_path: Path
 ) -> None:
     with ThreadPoolExecutor(1) as executor:
-        found = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
-    assert files(found) == files(whole)
+        bench = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
+    assert files(bench) == files(whole)
 
 
 def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
@@ -138,9 +138,9 @@ def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
 
 def test_a_cell_equals_the_log_of_its_command(whole: BenchResults) -> None:
     cell = whole.plan.cells[1]
-    words = shlex.split(cell.build(1).command)
-    assert words[:3] == ["trilat", "sim", "_bench_two"]
-    log = trilat_net.simulate(load_scenario(words[2], words[4::2]))
+    arguments = shlex.split(cell.build(1).command)
+    assert arguments[:3] == ["trilat", "sim", "_bench_two"]
+    log = trilat_net.simulate(load_scenario(arguments[2], arguments[4::2]))
     run, user = whole.runs[1], log["m1"]
     assert log.scenario.sha256 == run.sha256
     off = log["s"].q - user.q
@@ -344,15 +344,15 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
 def test_run_length_follows_the_slowest_time_constant(
     rate_per_s: float | None, length_s: float, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    judged = judged_run(rate_per_s)
+    judgement = judged_run(rate_per_s)
     monkeypatch.setattr(
         bench_run,
         "judge_bench_run",
-        lambda scenario, to_s: judged._replace(
+        lambda scenario, to_s: judgement._replace(
             scenario=msgspec.structs.replace(scenario, duration_s=to_s)
         ),
     )
-    longer = lengthen_run(judged)
+    longer = lengthen_run(judgement)
     assert longer.scenario.duration_s == length_s
     assert words in longer.text
 
@@ -360,8 +360,8 @@ def test_run_length_follows_the_slowest_time_constant(
 def test_a_decided_run_at_rest_is_not_extended() -> None:
     fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
     end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
-    judged = judged_run(-0.001, end=end, stability=Stability.SETTLED)
-    assert lengthen_run(judged) is judged
+    judgement = judged_run(-0.001, end=end, stability=Stability.SETTLED)
+    assert lengthen_run(judgement) is judgement
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:
@@ -416,8 +416,8 @@ def test_laws_get_nine_tenths_of_gravity() -> None:
     (told,) = plan_bench("full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]).cells
     (exact,) = plan_bench("full", laws=["p_d"], tasks=["free"], links=["rtt68"]).cells
     assert told.inputs != exact.inputs
-    found = [cell.build(1).scenario.sites["s"].control for cell in (told, exact)]
-    assert [control.gravity for control in found] == [0.9, 1.0]  # type: ignore[attr-defined]
+    controls = [cell.build(1).scenario.sites["s"].control for cell in (told, exact)]
+    assert [control.gravity for control in controls] == [0.9, 1.0]  # type: ignore[attr-defined]
 
 
 def test_a_law_with_constant_shares_hands_nothing_over() -> None:
@@ -528,15 +528,15 @@ def test_all_studies_have_gains_within_their_ranges() -> None:
 
 @pytest.mark.long
 def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
-    found = tune_laws({"level": ["p_d"]}, 1, budget=4)
-    assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
+    tuning = tune_laws({"level": ["p_d"]}, 1, budget=4)
+    assert [one.round_trip_ms for one in tuning] == list(TUNED_ROUND_TRIPS_MS)
     settings = format_settings(build_settings("level", "contact", "rtt272"))
     (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
     places = [
         n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED
     ]
     places.sort(key=lambda n: search.scores[n].error_rad or 0.0)
-    assert (found[1].settled, found[1].tried) == (len(places), 8)
+    assert (tuning[1].settled, tuning[1].tried) == (len(places), 8)
     later = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
 
     def keeps(place: int) -> bool:
@@ -544,13 +544,13 @@ def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
         return measure_candidate(*longer.texts).outcome is CandidateClass.SETTLED
 
     first = next(place for place in places if keeps(place))
-    assert (found[1].gains, found[1].passed) == (search.tried[first], places.index(first))
-    write_gains(found[:2], tmp_path / "gains.json")
-    write_gains(found[1:], tmp_path / "gains.json")
+    assert (tuning[1].gains, tuning[1].passed) == (search.tried[first], places.index(first))
+    write_gains(tuning[:2], tmp_path / "gains.json")
+    write_gains(tuning[1:], tmp_path / "gains.json")
     assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(
-        map(str, found)
+        map(str, tuning)
     )
-    assert find_stale(found) == []
+    assert find_stale(tuning) == []
 
 
 @pytest.mark.long
@@ -640,9 +640,9 @@ def test_gains_come_from_the_next_longer_round_trip() -> None:
 
 
 def test_gains_of_another_law_or_scenario_are_stale() -> None:
-    kept = asked().cells[0].tuned
-    other = msgspec.structs.replace(kept, fingerprint="0" * 16)
-    assert find_stale([other]) == [f"p_d (level, {kept.round_trip_ms} ms)"]
+    tuned = asked().cells[0].tuned
+    other = msgspec.structs.replace(tuned, fingerprint="0" * 16)
+    assert find_stale([other]) == [f"p_d (level, {tuned.round_trip_ms} ms)"]
 
 
 @pytest.mark.parametrize(

@@ -55,21 +55,23 @@ def test_short_text_has_verdicts_metrics_and_conclusion(logs: Path) -> None:
 
 @pytest.mark.long
 def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
-    printed = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
-    assert "the same experiment" in printed
-    assert "1: a.mcap" in printed
+    output = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
+    assert "the same experiment" in output
+    assert "1: a.mcap" in output
 
 
 def test_comparing_logs_of_different_scenarios_is_reported(logs: Path) -> None:
-    printed = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
-    assert "logs of different scenarios: free, two_sites" in printed
+    output = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
+    assert "logs of different scenarios: free, two_sites" in output
 
 
 def test_json_is_for_programs(logs: Path) -> None:
     facts = json.loads(trilat("compare", "a.mcap", "hang.mcap", "--json", cwd=logs).succeeds())
     assert facts["columns"] == ["a", "hang"]
     assert [log["scenario"] for log in facts["logs"]] == ["free", "free"]
-    assert {"control", "duration_s"} <= {one["key"] for one in facts["differences"]}
+    assert {"control", "duration_s"} <= {
+        difference["key"] for difference in facts["differences"]
+    }
     hanging = [
         log
         for log, remarks in facts["remarks"].items()
@@ -93,10 +95,10 @@ def test_search_reports_time_and_procedure_and_writes_folder(logs: Path) -> None
         "--out",
         "fronts",
     ]
-    printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
-    assert "18 runs on 1 core: about " in printed
-    assert "torques clamped at 60 N m" in printed
-    assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in printed
+    output = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
+    assert "18 runs on 1 core: about " in output
+    assert "torques clamped at 60 N m" in output
+    assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in output
     written = sorted(path.name for path in (logs / "fronts").iterdir())
     assert written == ["front.json", "front.md", "front.pdf", "front.png"]
     again = trilat(

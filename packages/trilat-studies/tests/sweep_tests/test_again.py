@@ -35,17 +35,17 @@ def test_command_of_cell_gives_its_numbers_bitwise(
     assert any(row["extended"] for row in results.rows)
     for row in results.rows:
         command, note = build_reproduce_command(results, row, tmp_path)
-        words = shlex.split(command)
-        done = trilat(*words[1:], cwd=tmp_path)
+        arguments = shlex.split(command)
+        done = trilat(*arguments[1:], cwd=tmp_path)
         outcome = results.outcome(row)
         assert done.code == (0 if outcome.diverged_s is None else 1), done
-        log = open_log(tmp_path / words[-1])
-        seen = classify_log_end(log)
-        assert seen.end_error_rad == outcome.end_error_rad
-        assert seen.end_speed_rad_s == outcome.end_speed_rad_s
+        log = open_log(tmp_path / arguments[-1])
+        run_end = classify_log_end(log)
+        assert run_end.end_error_rad == outcome.end_error_rad
+        assert run_end.end_speed_rad_s == outcome.end_speed_rad_s
         stability = certify_run(log).stability
         assert outcome.stability == stability
-        assert classify_decision(stability, seen.behaviour) is outcome.verdict
+        assert classify_decision(stability, run_end.behaviour) is outcome.verdict
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
         ended_s = max(float(log[name].t_s[-1]) for name in log.sites)
@@ -64,8 +64,8 @@ def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: 
         source.write_text(SHORT)
     assert "has changed since the sweep" in note
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
-    words = shlex.split(command)
-    trilat(*words[1:], cwd=tmp_path)
+    arguments = shlex.split(command)
+    trilat(*arguments[1:], cwd=tmp_path)
     assert (
         classify_log_end(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad
         == row["end_error_rad"]

@@ -42,22 +42,26 @@ def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Jud
         tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
     )
     run_cell(CellItem(plan, plan.cell(1), 1))
-    words = shlex.split(build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))
-    assert words[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
-    assert words[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
-    settings = words[3:-6]
+    arguments = shlex.split(
+        build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap")
+    )
+    assert arguments[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
+    assert arguments[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
+    settings = arguments[3:-6]
     assert settings[::2] == ["--set"] * (len(settings) // 2)
-    assert load_chosen_scenario(words[2], settings[1::2], 0.25, 1).text == judge.texts[0]
+    assert load_chosen_scenario(arguments[2], settings[1::2], 0.25, 1).text == judge.texts[0]
 
 
 @pytest.mark.usefixtures("judge")
 def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
     plan = asked(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
     task = CellItem(plan, plan.cell(3), 1)
-    sent = pickle.loads(pickle.dumps(task))
-    assert run_cell(sent) == run_cell(task)
+    restored_task = pickle.loads(pickle.dumps(task))
+    assert run_cell(restored_task) == run_cell(task)
     assert (
-        parse_scenario(apply_diff(run_cell(sent).scenario, plan.base.text)).sites["s"].control.K
+        parse_scenario(apply_diff(run_cell(restored_task).scenario, plan.base.text))
+        .sites["s"]
+        .control.K
     )
 
 
@@ -86,12 +90,12 @@ def test_a_text_is_restored_whatever_its_reference(text: str, base: str) -> None
 def test_only_the_changed_line_differs(text: str, line: int, other: str) -> None:
     lines = text.split("\n")
     lines[line % len(lines)] = other
-    own = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]
-    assert own in ([other], [])
+    parts = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]
+    assert parts in ([other], [])
 
 
 def test_a_scenario_differs_in_what_an_override_changed() -> None:
     base = load_scenario("p_d_margin")
     changed = load_scenario("p_d_margin", ["sites.m1.control.d=2.5", "seed=7"])
-    own = [part for part in diff_lines(changed.text, base.text) if isinstance(part, str)]
-    assert own == ["seed = 7", "d = [2.5, 2.5]"]
+    parts = [part for part in diff_lines(changed.text, base.text) if isinstance(part, str)]
+    assert parts == ["seed = 7", "d = [2.5, 2.5]"]

@@ -50,16 +50,16 @@ def results(**axes: tuple[object, ...]) -> SweepResults:
 
 def test_every_panel_has_its_own_lines() -> None:
     """Play-out of 400 ms requires d = 2 whatever the delay."""
-    made = build_stability_map(
+    stability_map = build_stability_map(
         results(link__playout_ms=(0.0, 400.0)), ("trilat sweep",), linearly=False
     )
-    (direct,), (played,) = made.lines
-    y = made.plane.y
+    (direct,), (played,) = stability_map.lines
+    y = stability_map.plane.y
     assert np.allclose(
         [direct.crossings(n, y) for n in range(1, 5)], [[0.5], [1.0], [1.5], [2.0]]
     )
     assert np.allclose([played.crossings(n, y) for n in range(5)], 2.0)
-    assert made.remarks == ()
+    assert stability_map.remarks == ()
 
 
 @pytest.mark.long
@@ -107,36 +107,34 @@ def test_coarse_map_has_the_exact_linear_line() -> None:
 
 
 def test_a_strip_has_no_lines() -> None:
-    asked = plan_sweep("p_d_margin", over=OVER[:1])
+    plan = plan_sweep("p_d_margin", over=OVER[:1])
     made = [row for row in rows() if row["control.d"] == 0.7]
-    assert build_stability_map(SweepResults(asked, made), ()).lines == ((),)
+    assert build_stability_map(SweepResults(plan, made), ()).lines == ((),)
 
 
 def test_place_of_panel_is_cell_of_plan() -> None:
     """Lines belong to the scenarios that run: every cell's scenario, with every law."""
-    asked = plan_sweep(
-        "p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d")
-    )
+    plan = plan_sweep("p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d"))
     made = []
     for law, row in product(("p_d", "pd_d"), rows(link__playout_ms=(0.0, 400.0))):
         made.append({**row, "law": law})
-    drawn = build_stability_map(SweepResults(asked, made), (), linearly=False).plane
-    assert [panel.title for panel in drawn.panels] == [
+    plane = build_stability_map(SweepResults(plan, made), (), linearly=False).plane
+    assert [panel.title for panel in plane.panels] == [
         f"{law}, playout {ms} ms" for law in ("p_d", "pd_d") for ms in (0, 400)
     ]
-    for n in range(0, asked.cells, 7):
-        cell = asked.cell(n)
+    for n in range(0, plan.cells, 7):
+        cell = plan.cell(n)
         playout = cell.values[2]
         (panel,) = (
             p
-            for p in drawn.panels
+            for p in plane.panels
             if p.settings == (("law", cell.law), ("link.playout_ms", playout))
         )
-        at = make_panel_loader(asked, panel, drawn.x.key, drawn.y.key)
+        at = make_panel_loader(plan, panel, plane.x.key, plane.y.key)
         delay, damping = cell.values[:2]
         assert isinstance(delay, float)
         assert isinstance(damping, float)
-        assert at(delay, damping) == asked.scenario(*cell.overrides)
+        assert at(delay, damping) == plan.scenario(*cell.overrides)
 
 
 @pytest.mark.parametrize(
@@ -199,9 +197,9 @@ def test_a_condition_holds_without_any_reserve(root: float, power: float, sign: 
         gap = value - root
         return spare(sign * float(np.sign(gap)) * abs(gap) ** power)
 
-    found = find_criterion_edge(condition, -60.0, 60.0)
-    assert found is not None
-    assert abs(condition(found).excess) <= 1e-5 * 120.0**power
+    edge = find_criterion_edge(condition, -60.0, 60.0)
+    assert edge is not None
+    assert abs(condition(edge).excess) <= 1e-5 * 120.0**power
 
 
 def test_whole_number_keys_have_no_points_between() -> None:
@@ -270,18 +268,18 @@ DELAY_MS = st.integers(2, 5000)  # of one tick the sampling asks for more
 
 
 def excess(scenario: Scenario) -> float:
-    found = evaluate_criterion(scenario)
-    assert found is not None
-    return found.excess
+    criterion = evaluate_criterion(scenario)
+    assert criterion is not None
+    return criterion.excess
 
 
 @given(GAIN, GAIN, DELAY_MS)
 def test_equal_sites_need_half_stiffness_times_delay(K: float, d: float, delay_ms: int) -> None:
     """Three sites with equal shares: the least eigenvalue of alpha is -1/2."""
-    one = load_scenario(
+    scenario = load_scenario(
         "p_d_margin", {"control.K": K, "control.d": d, "link.delay_ms": delay_ms}
     )
-    assert excess(one) == pytest.approx(d - 0.5 * K * delay_ms / 1e3, abs=1e-9)
+    assert excess(scenario) == pytest.approx(d - 0.5 * K * delay_ms / 1e3, abs=1e-9)
 
 
 @given(GAIN, GAIN, GAIN, GAIN, DELAY_MS, DELAY_MS)
@@ -304,10 +302,10 @@ def test_the_general_conditions_sign_judges_two_sites(
 
 def test_for_two_equal_sites_both_conditions_agree() -> None:
     """N = 2: abs(lambda_min) = 1, d = K T."""
-    one = load_scenario(
+    scenario = load_scenario(
         "p_d_margin_two", {"control.d": 2.0, "control.K": 10.0, "link.delay_ms": 200.0}
     )
-    assert excess(one) == pytest.approx(0.0, abs=1e-12)
+    assert excess(scenario) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_digital_scheme_needs_gravity_learnt_slowly_enough() -> None:

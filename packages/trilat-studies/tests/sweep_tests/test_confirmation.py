@@ -58,16 +58,19 @@ def runner(folder: Path, *problems: str, instead: Scenario | None = None) -> Ses
 @pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
 def test_equal_runs_have_equal_verdicts(scenario: Scenario, tmp_path: Path) -> None:
     row = cell(scenario)
-    found = confirm_cell(row, runner(tmp_path))
-    assert found.same
-    assert found.live is found.virtual is CellClass(row["verdict"])
-    assert found.log == tmp_path / "cell-3.mcap"
+    confirmation = confirm_cell(row, runner(tmp_path))
+    assert confirmation.same
+    assert confirmation.live is confirmation.virtual is CellClass(row["verdict"])
+    assert confirmation.log == tmp_path / "cell-3.mcap"
 
 
 def test_different_runs_have_different_verdicts(tmp_path: Path) -> None:
-    found = confirm_cell(cell(CALM), runner(tmp_path, instead=WILD))
-    assert not found.same
-    assert (found.virtual, found.live) == (CellClass.CONVERGED, CellClass.DIVERGED)
+    confirmation = confirm_cell(cell(CALM), runner(tmp_path, instead=WILD))
+    assert not confirmation.same
+    assert (confirmation.virtual, confirmation.live) == (
+        CellClass.CONVERGED,
+        CellClass.DIVERGED,
+    )
 
 
 def test_a_session_lasts_as_long_as_its_cell(tmp_path: Path) -> None:
@@ -85,16 +88,20 @@ def test_a_session_lasts_as_long_as_its_cell(tmp_path: Path) -> None:
 
 def test_a_failed_run_confirms_nothing(tmp_path: Path) -> None:
     row = cell(CALM)
-    found = confirm_cell(row, runner(tmp_path, "s was killed by SIGKILL"))
-    assert (found.same, found.live, found.text) == (False, None, "s was killed by SIGKILL")
+    confirmation = confirm_cell(row, runner(tmp_path, "s was killed by SIGKILL"))
+    assert (confirmation.same, confirmation.live, confirmation.text) == (
+        False,
+        None,
+        "s was killed by SIGKILL",
+    )
 
     def torn(_: Scenario, name: str) -> tuple[Path, Sequence[str]]:
         (tmp_path / name).write_bytes(b"no log")
         return tmp_path / name, []
 
-    found = confirm_cell(row, torn)
-    assert (found.same, found.live) == (False, None)
-    assert "cell-3" in found.text
+    confirmation = confirm_cell(row, torn)
+    assert (confirmation.same, confirmation.live) == (False, None)
+    assert "cell-3" in confirmation.text
     missing = confirm_cell(row, lambda *_, **__: (tmp_path / "missing.mcap", []))
     assert (missing.same, missing.log) == (False, None)
 
@@ -105,10 +112,10 @@ def stable(row: Row) -> bool | None:
 
 def test_equally_many_cells_lie_on_either_side() -> None:
     every = list(rows())
-    found = choose_cells_near_edges(every, KEYS, 3)
-    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
-    assert len({row["cell"] for row in found}) == 6
-    for row in found:
+    cells = choose_cells_near_edges(every, KEYS, 3)
+    assert [stable(row) for row in cells] == [True] * 3 + [False] * 3
+    assert len({row["cell"] for row in cells}) == 6
+    for row in cells:
         delay, d = row[KEYS[0]], row[KEYS[1]]
         near = [
             one
@@ -120,8 +127,8 @@ def test_equally_many_cells_lie_on_either_side() -> None:
 
 
 def test_cells_are_spread_over_the_edge() -> None:
-    found = choose_cells_near_edges(list(rows()), KEYS, 2)
-    delays = [row[KEYS[0]] for row in found if stable(row)]
+    cells = choose_cells_near_edges(list(rows()), KEYS, 2)
+    delays = [row[KEYS[0]] for row in cells if stable(row)]
     assert max(delays) - min(delays) >= 300
 
 
@@ -131,8 +138,8 @@ def test_undecided_cells_move_the_edge_beyond_them() -> None:
             CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
         )
 
-    found = choose_cells_near_edges(list(rows(band)), KEYS, 3)
-    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
+    cells = choose_cells_near_edges(list(rows(band)), KEYS, 3)
+    assert [stable(row) for row in cells] == [True] * 3 + [False] * 3
     with pytest.raises(UsageError, match="no edge"):
         choose_cells_near_edges(list(rows(lambda *_, **__: CellClass.UNDECIDED)), KEYS, 1)
 
@@ -197,5 +204,5 @@ def test_zenoh_sessions_have_the_verdict_of_virtual_time(
         outcome = run_demo(wanted, tmp_path, Console(quiet=True))
         return outcome.log, outcome.problems
 
-    found = confirm_cell(cell(scenario), run)
-    assert found.same, found.text
+    confirmation = confirm_cell(cell(scenario), run)
+    assert confirmation.same, confirmation.text

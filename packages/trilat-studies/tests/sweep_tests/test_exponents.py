@@ -90,7 +90,11 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
     made = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
     plane = build_plane(made, KEYS, P_D)
     figure = draw_stability_map(plane, ((),), make_print_size(3.5))
-    mesh: Any = next(one for one in figure.axes[0].collections if isinstance(one, QuadMesh))
+    mesh: Any = next(
+        collection
+        for collection in figure.axes[0].collections
+        if isinstance(collection, QuadMesh)
+    )
     assert to_hex(mesh.to_rgba(0.0)) == "#ffffff"
     assert mesh.get_clim() == (-1.0, 1.0)
     assert figure.axes[-1].get_yticks().tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0]

@@ -221,8 +221,8 @@ def test_a_run_refused_by_full_disk_is_pending(path: Path) -> None:
             journal._file = full
             with pytest.raises(
                 LogRefused, match=r"No space left on device.*make room, and continue with"
-            ) as found:
+            ) as error:
                 journal.add(FIVE[1])
         journal._file = whole
         assert [entry.cell for entry in journal.done.values()] == [FIVE[0].cell]
-    assert found.value.exit_code == 5
+    assert error.value.exit_code == 5

@@ -175,7 +175,7 @@ def test_trials_see_no_roots_but_certificates_do() -> None:
     assert cell.verdict is CellClass.BOUNDED
     assert "this rest: unstable" in cell.reasons
     assert measure_virtual_run(scenario).end.stability is Stability.SETTLED
-    found = certify_run(trilat_net.simulate(scenario))
-    assert found.end.stability is Stability.SETTLED
-    assert found.stability is Stability.NOT_STABLE
-    assert found.decision.rests_on.startswith("exact roots, fastest growing +")
+    certificate = certify_run(trilat_net.simulate(scenario))
+    assert certificate.end.stability is Stability.SETTLED
+    assert certificate.stability is Stability.NOT_STABLE
+    assert certificate.decision.rests_on.startswith("exact roots, fastest growing +")

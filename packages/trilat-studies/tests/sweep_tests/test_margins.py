@@ -82,21 +82,21 @@ def test_the_number_of_processes_changes_nothing() -> None:
     """Runs of p_d at 100 Hz for 1 s; their verdicts do not matter."""
     brief = ["duration_s=1.0", "rate_hz=100"]
     within = WITHIN._replace(tolerance=0.2)
-    wanted = plan_sweep(
+    plan = plan_sweep(
         "p_d_margin",
         brief,
         over=["link.delay_ms=100,400", format_range_axis(within)],
         longest_s=1.0,
     )
-    assert search_margins(wanted, within, 1) == search_margins(wanted, within, 2)
+    assert search_margins(plan, within, 1) == search_margins(plan, within, 2)
 
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
 def test_whole_number_keys_are_searched_in_integers() -> None:
     """The judge gives 300 Hz and 50 Hz the same verdict; no value between whole numbers may be run."""
     within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
-    wanted = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
-    assert [one.margin.stable for one in search_margins(wanted, within, 1)] == [True, True]
+    plan = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
+    assert [margin.margin.stable for margin in search_margins(plan, within, 1)] == [True, True]
 
 
 def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
@@ -129,14 +129,14 @@ def test_table_shows_edges_islands_and_missing_edges() -> None:
 
 def test_the_facts_are_json_and_name_the_command() -> None:
     margins = SweepMargins(asked(), WITHIN, [found(StabilityEdge(0.49, 0.492, False, True))])
-    told = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
-    assert told["command"] == margins.command
-    assert told["command"].endswith(
+    facts = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
+    assert facts["command"] == margins.command
+    assert facts["command"].endswith(
         "--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005"
     )
-    (place,) = told["places"]
+    (place,) = facts["places"]
     assert place.pop("link.delay_ms") == 100.0
-    assert is_documented("sweep --margin", told)
+    assert is_documented("sweep --margin", facts)
     assert place["edges"] == [
         {"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}
     ]

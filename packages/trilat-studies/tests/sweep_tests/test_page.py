@@ -117,7 +117,12 @@ def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = 
 
 
 def meshes(made: Figure) -> list[QuadMesh]:
-    return [one for axes in made.axes for one in axes.collections if isinstance(one, QuadMesh)]
+    return [
+        collection
+        for axes in made.axes
+        for collection in axes.collections
+        if isinstance(collection, QuadMesh)
+    ]
 
 
 def every(*place: Any) -> CellClass:
@@ -155,7 +160,11 @@ def test_classes_differ_in_lightness() -> None:
 
 def test_lines_are_drawn_where_they_are_and_named() -> None:
     made = figure(drawn(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
-    first, second = (one for one in made.axes[0].collections if isinstance(one, QuadContourSet))
+    first, second = (
+        collection
+        for collection in made.axes[0].collections
+        if isinstance(collection, QuadContourSet)
+    )
     for line in (first, second):
         ends = np.concatenate([path.vertices for path in line.get_paths()])
         assert np.allclose(ends[:, 1], 5e-3 * ends[:, 0])
@@ -270,7 +279,7 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
 def test_gains_that_were_not_swept_are_named(
     axes: list[str], laws: list[str], texts: list[str]
 ) -> None:
-    found = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
-    assert len(found) == len(texts)
-    for one, text in zip(found, texts, strict=True):
+    gains = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
+    assert len(gains) == len(texts)
+    for one, text in zip(gains, texts, strict=True):
         assert one.startswith(text)

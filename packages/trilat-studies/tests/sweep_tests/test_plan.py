@@ -110,16 +110,16 @@ def test_facts_restore_the_plan(cube: SweepPlan) -> None:
 
 
 def test_a_law_of_all_sites_keeps_its_gains() -> None:
-    found = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
-    stays, other = (found.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
+    plan = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
+    stays, other = (plan.scenario(*plan.cell(n).overrides).sites["s"].control for n in (0, 1))
     assert (stays.K, stays.d) == ((7.0, 7.0), (1.1, 1.1))
     assert (other.K, other.Kd, other.d) == ((7.0, 7.0), (3.0, 3.0), (5.0, 5.0))
 
 
 def test_another_law_replaces_every_sites_law_and_gains() -> None:
-    found = plan_sweep("contact", laws=["p_f", "p_d"])
-    assert found.cell(0).overrides == ()
-    of_all = found.scenario(*found.cell(1).overrides)
+    plan = plan_sweep("contact", laws=["p_f", "p_d"])
+    assert plan.cell(0).overrides == ()
+    of_all = plan.scenario(*plan.cell(1).overrides)
     assert {spec.control for spec in of_all.sites.values()} == {
         load_scenario("paper", ["control.law=p_d"]).sites["s"].control
     }
@@ -233,12 +233,12 @@ def test_a_range_is_whole_steps_from_its_start(
     first: Decimal, step: Decimal, count: int, beyond: Decimal
 ) -> None:
     last = first + (count - 1 + beyond) * step
-    found = parse_axis(f"control.d={first}:{last}:{step}")
-    assert len(found.texts) == count
-    assert found.numeric
-    values = [Decimal(text) for text in found.texts]
+    axis = parse_axis(f"control.d={first}:{last}:{step}")
+    assert len(axis.texts) == count
+    assert axis.numeric
+    values = [Decimal(text) for text in axis.texts]
     assert values == [first + n * step for n in range(count)]
-    assert [found.value(n) for n in range(count)] == [float(value) for value in values]
+    assert [axis.value(n) for n in range(count)] == [float(value) for value in values]
     downwards = parse_axis(f"control.d={values[-1]}:{first}:{-step}")
     assert [Decimal(text) for text in downwards.texts] == values[::-1]
 
@@ -254,13 +254,13 @@ def test_written_exponents_keep_whole_numbers_whole() -> None:
 
 
 def test_a_list_may_hold_words_numbers_and_tables() -> None:
-    found = parse_axis(" link.order = newest, in_order ")
-    assert (found.description, found.key, found.texts) == (
+    axis = parse_axis(" link.order = newest, in_order ")
+    assert (axis.description, axis.key, axis.texts) == (
         "link.order=newest, in_order",
         "link.order",
         ("newest", "in_order"),
     )
-    assert (found.numeric, found.value(1)) == (False, "in_order")
+    assert (axis.numeric, axis.value(1)) == (False, "in_order")
     assert parse_axis("a=1,2.5,1e3").numeric
     assert parse_axis("a=true,false").value(0) == "true"
     assert parse_axis("q0_rad=[0.1,0.2],[0.3,0.4]").texts == ("[0.1,0.2]", "[0.3,0.4]")
@@ -268,9 +268,9 @@ def test_a_list_may_hold_words_numbers_and_tables() -> None:
 
 
 def test_huge_ranges_take_no_memory() -> None:
-    found = parse_axis("a=0:1e8:0.001")
-    assert len(found.texts) == 10**11 + 1
-    assert found.texts[10**11] == "100000000.000"
+    axis = parse_axis("a=0:1e8:0.001")
+    assert len(axis.texts) == 10**11 + 1
+    assert axis.texts[10**11] == "100000000.000"
 
 
 @pytest.mark.parametrize(

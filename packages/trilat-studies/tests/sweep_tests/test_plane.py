@@ -27,8 +27,8 @@ from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> None:
     random = np.random.default_rng(chance)
     made = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
-    found = build_plane([made[n] for n in order], KEYS, P_D)
-    (panel,) = found.panels
+    plane = build_plane([made[n] for n in order], KEYS, P_D)
+    (panel,) = plane.panels
     assert panel.counts.sum() == 50
     for row in made:
         i, j = DAMPINGS.index(row[KEYS[1]]), DELAYS_MS.index(row[KEYS[0]])
@@ -69,17 +69,17 @@ def test_words_and_further_axes_make_panels() -> None:
 
 def test_an_axis_of_words_is_never_drawn() -> None:
     made = list(rows(link__order=("newest", "in_order")))
-    found = build_plane(made, ["link.order", *KEYS], P_D)
-    assert (found.x.key, found.y.key) == KEYS
-    assert len(found.panels) == 2
+    plane = build_plane(made, ["link.order", *KEYS], P_D)
+    assert (plane.x.key, plane.y.key) == KEYS
+    assert len(plane.panels) == 2
 
 
 def test_a_single_axis_is_a_strip() -> None:
-    found = build_plane(
+    plane = build_plane(
         [row for row in rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D
     )
-    assert (found.y.key, found.y.values) == ("", (0.0,))
-    assert found.panels[0].counts.shape == (1, 5, 4)
+    assert (plane.y.key, plane.y.values) == ("", (0.0,))
+    assert plane.panels[0].counts.shape == (1, 5, 4)
 
 
 def test_whole_numbers_stay_whole() -> None:

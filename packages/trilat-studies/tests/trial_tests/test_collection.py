@@ -76,20 +76,20 @@ def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None
 
 def test_figures_follow_their_definitions() -> None:
     chosen = scenario(**{"expect.synchronised_rad": 0.3})
-    found, log = measure_virtual_run(chosen), trilat_net.simulate(chosen)
+    figures, log = measure_virtual_run(chosen), trilat_net.simulate(chosen)
     errors = {name: np.abs(log[name].e) for name in log.sites}
     end = log["m1"].t_s > log["m1"].t_s[-1] - 1.0
     poses = np.array([log[name].q[end] for name in log.sites])
-    assert found.simulated_s == 2.5
-    assert found.peak_error_rad == max(e.max() for e in errors.values())
-    assert found.end_error_rad == max(e[end].max() for e in errors.values())
-    assert found.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
-    assert found.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
+    assert figures.simulated_s == 2.5
+    assert figures.peak_error_rad == max(e.max() for e in errors.values())
+    assert figures.end_error_rad == max(e[end].max() for e in errors.values())
+    assert figures.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
+    assert figures.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
     apart = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
     assert 0.0 < max(apart) < 2.4
-    assert found.synchronised_at_s == max(apart)
-    assert found.ages["m1->s"].mean_ms == found.ages["m1->s"].max_ms == 20.0
-    assert (found.late_samples, found.missing, found.end.diverged_at_s) == (0, 0, None)
+    assert figures.synchronised_at_s == max(apart)
+    assert figures.ages["m1->s"].mean_ms == figures.ages["m1->s"].max_ms == 20.0
+    assert (figures.late_samples, figures.missing, figures.end.diverged_at_s) == (0, 0, None)
 
 
 def test_a_run_without_convergence_has_no_convergence_time() -> None:
@@ -100,16 +100,16 @@ def test_a_run_without_convergence_has_no_convergence_time() -> None:
 
 
 def test_a_link_without_samples_has_no_age() -> None:
-    found = measure_virtual_run(scenario(links={"m1->s": {"delay_ms": 9000.0}}))
-    assert found.ages["m1->s"].mean_ms is found.ages["m1->s"].max_ms is None
-    assert found.ages["m2->s"].max_ms == 20.0
+    figures = measure_virtual_run(scenario(links={"m1->s": {"delay_ms": 9000.0}}))
+    assert figures.ages["m1->s"].mean_ms is figures.ages["m1->s"].max_ms is None
+    assert figures.ages["m2->s"].max_ms == 20.0
 
 
 def test_a_diverged_run_has_its_instant() -> None:
-    found = measure_virtual_run(scenario(**{"limits.qd_limit_rad_s": 0.3}))
-    assert found.end.diverged_at_s is not None
-    assert found.simulated_s == pytest.approx(found.end.diverged_at_s, abs=0.01)
-    assert found.missing == 0
+    figures = measure_virtual_run(scenario(**{"limits.qd_limit_rad_s": 0.3}))
+    assert figures.end.diverged_at_s is not None
+    assert figures.simulated_s == pytest.approx(figures.end.diverged_at_s, abs=0.01)
+    assert figures.missing == 0
 
 
 def test_every_missing_record_of_a_log_is_counted() -> None:
@@ -257,11 +257,13 @@ def rows(seed: int) -> RecordBatch:
 
 def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
     scenario = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100})
-    made = WindowStats(ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s")
+    window_stats = WindowStats(
+        ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s"
+    )
     for first, last in pairwise([0, *sorted(cuts), RECORDS]):
         if first < last:
-            made.add(RecordBatch(*(column[first:last] for column in records)))
-    return made.compute_ranges()
+            window_stats.add(RecordBatch(*(column[first:last] for column in records)))
+    return window_stats.compute_ranges()
 
 
 @given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, RECORDS), max_size=8))
@@ -385,7 +387,10 @@ def test_any_metric_may_be_expected() -> None:
     compared = trilat_net.compare(log, log).metrics
     run, logged = measure_virtual_run(scenario), measure_log(log)
     assert run.metrics == logged.metrics
-    found = {one.key: one for one in evaluate_expectations(scenario.expect, run)}
+    found = {
+        expectation.key: expectation
+        for expectation in evaluate_expectations(scenario.expect, run)
+    }
     assert [found[f"metrics.{key}"].held for key in asked] == [False, True, False]
     assert found["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
     assert "nothing is learnt" in found["metrics.theta_error_last"].measured

@@ -180,10 +180,12 @@ def test_an_unreached_window_does_not_hold() -> None:
 
 
 def test_a_window_names_units_and_all_sites() -> None:
-    asked = ExpectWindow(
+    expect_window = ExpectWindow(
         from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
     )
-    outcomes = evaluate_expectations(Expect(windows=(asked,)), figures(windows=(SPANS,)))
+    outcomes = evaluate_expectations(
+        Expect(windows=(expect_window,)), figures(windows=(SPANS,))
+    )
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
     assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]
 

@@ -82,18 +82,18 @@ def assert_proven(found: ArmGains) -> None:
 @pytest.mark.parametrize("delay", ["0", "20ms"])
 @pytest.mark.parametrize("name", ["one joint", "slide"])
 def test_runs_confirm_the_edge(name: str, delay: str, tmp_path: Path) -> None:
-    found = tune(name, delay, tmp_path, poses=2)
-    assert_confirmed(found)
-    assert_proven(found)
+    tuning = tune(name, delay, tmp_path, poses=2)
+    assert_confirmed(tuning)
+    assert_proven(tuning)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("name", ARMS)
 def test_runs_confirm_the_edge_of_every_arm(name: str, delay: str, tmp_path: Path) -> None:
-    found = tune(name, delay, tmp_path)
-    assert_confirmed(found)
-    assert_proven(found)
+    tuning = tune(name, delay, tmp_path)
+    assert_confirmed(tuning)
+    assert_proven(tuning)
 
 
 def gains(found: ArmGains, name: str) -> np.ndarray:
@@ -111,23 +111,23 @@ def one_joint(tmp_path: Path) -> Path:
 
 def test_one_joint_has_the_edge_of_its_equation(one_joint: Path) -> None:
     """M w^2 = K (1 + cos w T) and d w = K sin w T, with d = 2 zeta sqrt(K M)."""
-    found = tune_arm(one_joint, "60ms", poses=1, margin=2.0, damping=0.7)
+    tuned_arm = tune_arm(one_joint, "60ms", poses=1, margin=2.0, damping=0.7)
     zeta = 0.7 / math.sqrt(2.0)
     w = math.sqrt(2.0 - 4.0 * zeta**2)
     k = (math.acos(w * w - 1.0) / w / 0.06) ** 2
-    assert found.edge["continuous_per_s2"] == pytest.approx(k, rel=1e-3)
-    assert found.edge["k_per_s2"] == pytest.approx(k, rel=1e-2)
+    assert tuned_arm.edge["continuous_per_s2"] == pytest.approx(k, rel=1e-3)
+    assert tuned_arm.edge["k_per_s2"] == pytest.approx(k, rel=1e-2)
     M = 3.0 * 0.5**2 / 3.0
-    assert gains(found, "inertia") == pytest.approx([M], rel=1e-6)
-    assert gains(found, "K") == pytest.approx([k * M / 2.0], rel=1e-2)
-    assert gains(found, "d") == pytest.approx(
-        2.0 * 0.7 * np.sqrt(gains(found, "K") * M), rel=2e-3
+    assert gains(tuned_arm, "inertia") == pytest.approx([M], rel=1e-6)
+    assert gains(tuned_arm, "K") == pytest.approx([k * M / 2.0], rel=1e-2)
+    assert gains(tuned_arm, "d") == pytest.approx(
+        2.0 * 0.7 * np.sqrt(gains(tuned_arm, "K") * M), rel=2e-3
     )
 
 
 @pytest.mark.parametrize("name", ["slide", pytest.param("arm6.urdf", marks=pytest.mark.long)])
 def test_modes_begin_to_grow_at_the_edge(name: str, tmp_path: Path) -> None:
-    found = tune(name, "20ms", tmp_path, poses=3, set={"arm.g_m_s2": 0})
+    tuning = tune(name, "20ms", tmp_path, poses=3, set={"arm.g_m_s2": 0})
     arm = str(tmp_path / "odd.urdf") if name in ODD_ARMS else name
     loop = {
         "name": "loop",
@@ -138,10 +138,10 @@ def test_modes_begin_to_grow_at_the_edge(name: str, tmp_path: Path) -> None:
         "link": {"delay_ms": 20.0},
         "control": {"law": "p_d", "K": 1e-6, "d": 1e-6},
     }
-    M = tn.load_scenario(loop).arms["m"].inertia(np.array(found.edge["pose"]))
+    M = tn.load_scenario(loop).arms["m"].inertia(np.array(tuning.edge["pose"]))
     for share, grows in ((0.99, False), (1.01, True)):
-        k = share * found.edge["k_per_s2"]
-        m, zeta = gains(found, "inertia"), 0.7 / math.sqrt(2.0)
+        k = share * tuning.edge["k_per_s2"]
+        m, zeta = gains(tuning, "inertia"), 0.7 / math.sqrt(2.0)
         assert (count_growing(M, k * m, 2.0 * zeta * math.sqrt(k) * m, 20, 1e-3) > 0) is grows
 
 
@@ -188,12 +188,14 @@ def test_with_enough_damping_no_delay_bounds_the_stiffness(one_joint: Path) -> N
 
 @pytest.mark.parametrize("margin", [1.5, pytest.param(4.0, marks=pytest.mark.long)])
 def test_damping_keeps_the_margin_to_its_limit(margin: float, tmp_path: Path) -> None:
-    found = tune("slide", "1ms", tmp_path, poses=1, margin=margin)
-    assert found.edge["used_per_s2"] <= found.edge["limit_per_s2"] / margin**2 * (1.0 + 1e-9)
-    assert found.edge["used_per_s2"] <= found.edge["k_per_s2"]
-    m = gains(found, "inertia")
-    assert gains(found, "K") == pytest.approx(found.edge["used_per_s2"] * m / margin, rel=1e-3)
-    assert found.runs[0]["stable"]
+    tuning = tune("slide", "1ms", tmp_path, poses=1, margin=margin)
+    assert tuning.edge["used_per_s2"] <= tuning.edge["limit_per_s2"] / margin**2 * (1.0 + 1e-9)
+    assert tuning.edge["used_per_s2"] <= tuning.edge["k_per_s2"]
+    m = gains(tuning, "inertia")
+    assert gains(tuning, "K") == pytest.approx(
+        tuning.edge["used_per_s2"] * m / margin, rel=1e-3
+    )
+    assert tuning.runs[0]["stable"]
 
 
 @pytest.mark.long
@@ -212,20 +214,22 @@ def test_over_slow_jitter_growth_begins_more_than_once(one_joint: Path, tmp_path
 
     The gains are those of the constant delay, which is the tighter bound, and they are stable.
     """
-    found = tune_arm(one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1)
-    assert found.agree
-    assert [run["stable"] for run in found.runs] == [True, False, False]
+    tuned_arm = tune_arm(
+        one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1
+    )
+    assert tuned_arm.agree
+    assert [run["stable"] for run in tuned_arm.runs] == [True, False, False]
     assert (
-        found.edge["used_per_s2"]
-        == found.edge["constant_per_s2"]
-        < 0.5 * found.edge["k_per_s2"]
+        tuned_arm.edge["used_per_s2"]
+        == tuned_arm.edge["constant_per_s2"]
+        < 0.5 * tuned_arm.edge["k_per_s2"]
     )
 
 
 def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
-    found = tune_arm(one_joint, f"measured:{GOLDEN / 'live-4g.mcap'}", poses=1)
-    assert re.fullmatch(r"the delays of \w+->\w+ in live-4g.mcap", found.delay)
-    assert found.runs[0]["stable"]
+    tuned_arm = tune_arm(one_joint, f"measured:{GOLDEN / 'live-4g.mcap'}", poses=1)
+    assert re.fullmatch(r"the delays of \w+->\w+ in live-4g.mcap", tuned_arm.delay)
+    assert tuned_arm.runs[0]["stable"]
 
 
 def test_sessions_have_the_delay_of_their_slowest_link(
@@ -234,8 +238,8 @@ def test_sessions_have_the_delay_of_their_slowest_link(
     report = ping_sites()  # of a party on the party's clock
     monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
     words = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
-    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
-    assert told["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
+    facts = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    assert facts["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
 
 
 @pytest.mark.long
@@ -254,9 +258,9 @@ def test_gains_of_several_joints_scale_with_all_masses() -> None:
 
 
 def test_a_digital_controller_tolerates_less_gain(one_joint: Path) -> None:
-    held = tune_arm(one_joint, "5ms", poses=1, set={"scheme": "digital"})
-    assert_confirmed(held)
-    assert held.edge["k_per_s2"] < tune_arm(one_joint, "5ms", poses=1).edge["k_per_s2"]
+    tuned_arm = tune_arm(one_joint, "5ms", poses=1, set={"scheme": "digital"})
+    assert_confirmed(tuned_arm)
+    assert tuned_arm.edge["k_per_s2"] < tune_arm(one_joint, "5ms", poses=1).edge["k_per_s2"]
 
 
 SCENARIO = """name = "mine"
@@ -271,19 +275,19 @@ dominance = {{ m = {{ s = 1.0 }}, s = {{ m = 1.0 }} }}
 
 def test_the_printed_line_fits_a_scenario(one_joint: Path, tmp_path: Path) -> None:
     words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
-    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
-    (tmp_path / "mine.toml").write_text(SCENARIO.format(line=told["line"]), encoding="utf-8")
+    facts = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    (tmp_path / "mine.toml").write_text(SCENARIO.format(line=facts["line"]), encoding="utf-8")
     control = tn.load_scenario(tmp_path / "mine.toml").sites["m"].control
-    assert list(control.K) == [joint["K"] for joint in told["joints"]]
-    assert told["agree"] is True
+    assert list(control.K) == [joint["K"] for joint in facts["joints"]]
+    assert facts["agree"] is True
 
 
 def test_the_command_draws_and_prints(one_joint: Path, tmp_path: Path) -> None:
     words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--figure", "gains.png")
-    printed = trilat(*words, cwd=tmp_path).succeeds()
-    assert "effort limit" in printed
-    assert re.search(r"ok +run of .* at 0.95 of the edge: decays", printed)
-    assert re.search(r"ok +run of .* at 1.1 of the edge: grows", printed)
+    output = trilat(*words, cwd=tmp_path).succeeds()
+    assert "effort limit" in output
+    assert re.search(r"ok +run of .* at 0.95 of the edge: decays", output)
+    assert re.search(r"ok +run of .* at 1.1 of the edge: grows", output)
     assert (tmp_path / "gains.png").read_bytes().startswith(b"\x89PNG")
 
 

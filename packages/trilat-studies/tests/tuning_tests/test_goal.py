@@ -165,7 +165,7 @@ def scored(scenario: Scenario, alone: Scenario | None = None) -> CandidateScore:
 
 def test_error_and_effort_are_the_documented_sums() -> None:
     scenario = trio(*FIRM)
-    found = scored(scenario)
+    score = scored(scenario)
     run = trajectories(scenario)
     q, tau = run.stack("q"), run.stack("tau")
     # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
@@ -178,25 +178,25 @@ def test_error_and_effort_are_the_documented_sums() -> None:
     pose = beta @ q[:, 0] / beta.sum()
     inner, outer = 2.0 * 9.81 * np.cos(q[..., 0]), 9.81 * np.cos(q[..., 0] + q[..., 1])
     gravity = np.stack([inner + outer, outer], axis=-1)
-    assert found.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
-    assert found.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
-    assert found.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
-    assert found.pose_rad == pytest.approx(
+    assert score.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
+    assert score.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
+    assert score.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
+    assert score.pose_rad == pytest.approx(
         np.sqrt(np.mean((q.mean(axis=0) - pose) ** 2)), rel=1e-9
     )
     e = np.abs(q - run.stack("q_des")).max(axis=(0, 2))
-    assert found.settled_s == pytest.approx(0.01 * np.flatnonzero(e >= 0.01)[-1])
+    assert score.settled_s == pytest.approx(0.01 * np.flatnonzero(e >= 0.01)[-1])
 
 
 def test_arms_that_start_at_the_goal_do_nothing() -> None:
     still = trio(
         "control.law=p_d", *(f"sites.{name}.q0_rad=[0.2, 0.3]" for name in ("m1", "m2", "s"))
     )
-    found = scored(still)
-    assert found.outcome is CandidateClass.SETTLED
-    assert found.error_rad == pytest.approx(0.0, abs=1e-12)
-    assert found.effort_nm == pytest.approx(0.0, abs=1e-12)
-    assert found.settled_s == 0.0
+    score = scored(still)
+    assert score.outcome is CandidateClass.SETTLED
+    assert score.error_rad == pytest.approx(0.0, abs=1e-12)
+    assert score.effort_nm == pytest.approx(0.0, abs=1e-12)
+    assert score.settled_s == 0.0
 
 
 def test_hanging_arms_are_scored_by_their_fall() -> None:
@@ -219,17 +219,17 @@ def test_arms_that_sink_slowly_drift_before_they_hang() -> None:
         "control.K=400.0",
         "control.gravity=0.95",
     )
-    found = scored(trio(*sinking, "duration_s=15.0"))
-    assert 0.02 < (found.pose_rad or 0.0) < 0.15
-    assert found.outcome is CandidateClass.OSCILLATED
+    score = scored(trio(*sinking, "duration_s=15.0"))
+    assert 0.02 < (score.pose_rad or 0.0) < 0.15
+    assert score.outcome is CandidateClass.OSCILLATED
 
 
 def test_diverged_runs_have_no_error() -> None:
-    found = scored(trio(*FIRM, "limits.qd_limit_rad_s=0.2"))
-    assert found.outcome is CandidateClass.DIVERGED
-    assert found.error_rad is None
-    assert found.effort_nm is None
-    assert found.diverged_s is not None
+    score = scored(trio(*FIRM, "limits.qd_limit_rad_s=0.2"))
+    assert score.outcome is CandidateClass.DIVERGED
+    assert score.error_rad is None
+    assert score.effort_nm is None
+    assert score.diverged_s is not None
 
 
 def test_sites_of_different_rates_are_compared_simultaneously() -> None:

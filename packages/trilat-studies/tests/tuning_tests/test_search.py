@@ -35,8 +35,8 @@ def lost(_: dict[str, float]) -> CandidateScore:
 def searched(law: str, budget: int, seed: int, score: object = bowl) -> CandidateSearch:
     search = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR)
     for number in range(len(search.rounds)):
-        asked = search.propose_candidates(number)
-        search.record_scores(asked, [score(gains) for gains in asked])  # type: ignore[operator]
+        candidates = search.propose_candidates(number)
+        search.record_scores(candidates, [score(gains) for gains in candidates])  # type: ignore[operator]
     return search
 
 

@@ -80,11 +80,11 @@ def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
 def test_the_command_of_a_point_repeats_its_run(found: TuningResult) -> None:
     for one in found.found:
         for place in one.front:
-            words = shlex.split(found.candidate(one, place).command)
-            assert words[:2] == ["trilat", "sim"]
-            assert words[3::2] == ["--set"] * (len(words[3:]) // 2)
+            arguments = shlex.split(found.candidate(one, place).command)
+            assert arguments[:2] == ["trilat", "sim"]
+            assert arguments[3::2] == ["--set"] * (len(arguments[3:]) // 2)
             assert (
-                measure_candidate(load_scenario(words[2], words[4::2]).text, None)
+                measure_candidate(load_scenario(arguments[2], arguments[4::2]).text, None)
                 == one.scores[place]
             )
 
@@ -107,7 +107,7 @@ def test_failed_runs_are_in_facts_and_counted(tmp_path: Path) -> None:
         word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass
     }
     assert law["front"] == []
-    assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4
+    assert [candidate["outcome"] for candidate in law["candidates"]] == ["diverged"] * 4
     assert found.list_edge_gains(found.found[0]) == []
 
 
