@@ -56,9 +56,10 @@ def _unindent(text: str) -> str:
 
 
 def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
-    """Yields the words of every command of a block, and the lines of output that the block shows of it.
+    """Yields the words of every command of a block, and the lines of output that the block
+    shows for it.
 
-    What stands in [--brackets] may be given, and is.
+    Options in [--brackets] are optional, and are given.
     """
     lines = re.sub(r"\[(--[^\]]*)\]", r"\1", text.replace("\\\n", " ")).splitlines()
     shows = any(line.startswith("$ ") for line in lines)

@@ -1,4 +1,4 @@
-"""What a program sees in a process of its own that is given a folder with a file to be found there."""
+"""The view of a program in its own process on a folder that contains a planted file."""
 
 import json
 import subprocess

@@ -89,7 +89,7 @@ def least_energy(run: dict[str, Any]) -> float:
     return min(float(one.min()) for one in found)
 
 
-def drawn(law: str, seed: int) -> Scenario:
+def draw_energy_run(law: str, seed: int) -> Scenario:
     """Two or three sites, half of the runs with planar arms, over a bad network; shares change thrice.
 
     Half of the samples are lost, or delays are those of 4g, or jitter is as long as the delay. In most runs

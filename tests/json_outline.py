@@ -170,10 +170,10 @@ def outline(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
         yield path, _KINDS.get(type(value), "table" if isinstance(value, dict) else "list")
 
 
-def gather(found: list[Any]) -> dict[str, str]:
+def gather(values: list[Any]) -> dict[str, str]:
     """Returns the types of all keys of several samples."""
     kinds: dict[str, set[str]] = {}
-    for one in found:
+    for one in values:
         for path, kind in outline(one):
             kinds.setdefault(path.removeprefix("."), set()).add(kind)
     return {path: " or ".join(sorted(kinds[path])) for path in sorted(kinds)}

@@ -1,14 +1,15 @@
-"""Single-token changes of the rooms in which an error costs most, each judged by the tests of a push.
+"""Single-token changes of the rooms in which an error costs most, each judged by the tests of a
+push.
 
     python -m tests.mutants --seed 1 --count 40
 
-Changes are drawn by the seed, the same number from each room. Each is made in a copy of the tree, and the
-tests of a push run there, those nearest to the changed file first, until one fails; a changed core takes
-minutes to compile, so its own tests are tried without first. What survives them all is a law that no test
-states, or a change that means nothing.
+Changes are drawn by the seed, equally many from each room. Each change is made in a copy of the
+tree. The tests of a push run there, those nearest to the changed file first, until one fails. A
+changed core takes minutes to compile, so that its own tests run first without compilation. A
+change that survives all tests reveals a law that no test states, or has no effect.
 
-By rule these are not drawn, as no run can tell them: annotations and decorators, text for people (strings,
-and whatever a `raise` says), names that a module exports, and the bases of a class.
+Changes without effect on any run are not drawn: annotations and decorators, text for people
+(strings, and the arguments of `raise`), names that a module exports, and the bases of a class.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""A process of this system in which the program finds what Windows, macOS and Linux all have, and no more.
+"""A process of this system that hides from the program all that Windows, macOS or Linux lacks.
 
-What each has says typeshed, which comes with mypy. Only the modules of the program are kept from the rest:
-Python's library and other packages have forms of their own for every system. The process says of itself that
-it is one of Windows; the functions of Windows it has not.
+The names of each system come from typeshed, which is a part of mypy. Only the modules of the
+program are restricted, because Python's library and other packages have separate code for every
+system. The process reports to be one of Windows, and lacks the functions that only Windows has.
 """
 
 import ast

@@ -45,7 +45,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 def choose_long_tests(times_s: dict[str, float]) -> list[str]:
-    """Returns the tests that a push leaves, of those that took so long."""
+    """Returns the tests that a push leaves to the long run, by their processor times."""
     files: defaultdict[str, list[str]] = defaultdict(list)
     for name in sorted(times_s, key=lambda name: times_s[name]):
         files[name.partition("::")[0]].append(name)

@@ -20,18 +20,18 @@ PAPER_YEAR = "2016"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-def said(key: str) -> str:
+def read_field(key: str) -> str:
     """Returns a value at the top of the file."""
     (value,) = re.findall(rf"^{key}: \"?(.*?)\"?$", CITATION, re.MULTILINE)
     return str(value)
 
 
 def test_all_files_name_the_same_program() -> None:
-    assert said("cff-version") == "1.2.0"
-    assert said("type") == "software"
-    assert said("title") == PROJECT["name"]
-    assert said("version") == PROJECT["version"]
-    assert said("abstract") == PROJECT["description"]
+    assert read_field("cff-version") == "1.2.0"
+    assert read_field("type") == "software"
+    assert read_field("title") == PROJECT["name"]
+    assert read_field("version") == PROJECT["version"]
+    assert read_field("abstract") == PROJECT["description"]
     listed = re.findall(
         r"^  - \"?(.*?)\"?$",
         CITATION.split("keywords:")[1].split("references:")[0],
@@ -42,7 +42,7 @@ def test_all_files_name_the_same_program() -> None:
 
 def test_all_files_name_one_licence_and_holder() -> None:
     licence = (ROOT / "LICENSE").read_text(encoding="utf-8")
-    assert said("license") == PROJECT["license"] == "MIT"
+    assert read_field("license") == PROJECT["license"] == "MIT"
     assert licence.startswith("MIT License")
     (holder,) = re.findall(r"^Copyright \(c\) \d{4} (.+)$", licence, re.MULTILINE)
     (author,) = re.findall(r"^authors:\n  - name: \"(.+)\"$", CITATION, re.MULTILINE)

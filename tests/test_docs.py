@@ -352,12 +352,12 @@ def flat(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("page", "words", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
+    ("page", "phrase", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
 )
 def test_limits_on_pages_are_the_programs(
-    page: str, words: str, number: float, own: float
+    page: str, phrase: str, number: float, own: float
 ) -> None:
-    assert words in flat(find_page(page).read_text(encoding="utf-8"))
+    assert phrase in flat(find_page(page).read_text(encoding="utf-8"))
     assert number == pytest.approx(own, rel=1e-12)
 
 

@@ -141,8 +141,10 @@ def ports(name: str, **changes: Any) -> PortAnalysis:
     return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
 
-def felt(made: PortAnalysis) -> Any:
-    return next(one for one in made.transparency if (one.operator_site, one.joint) == ("m", 1))
+def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
+    return next(
+        one for one in port_analysis.transparency if (one.operator_site, one.joint) == ("m", 1)
+    )
 
 
 def learning(delay_ms: float) -> Numbers:
@@ -154,15 +156,15 @@ def learning(delay_ms: float) -> Numbers:
         *band[:2],
         least.least,
         least.least_hz,
-        *felt(made).interpolate_magnitudes(1.0),
-        felt(made).ratio_db,
+        *find_felt_impedance(made).interpolate_magnitudes(1.0),
+        find_felt_impedance(made).ratio_db,
     )
 
 
 def known(delay_ms: float) -> float:
     made = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
     assert made.velocity.passive
-    return float(felt(made).ratio_db)
+    return float(find_felt_impedance(made).ratio_db)
 
 
 def lacking() -> Numbers:
@@ -184,7 +186,7 @@ def reflecting(delay_ms: float, d: float) -> PortAnalysis:
 def stable_with_any(delay_ms: float, d: float) -> Numbers:
     made = reflecting(delay_ms, d)
     assert not made.absolute.below
-    return [felt(made).ratio_db]
+    return [find_felt_impedance(made).ratio_db]
 
 
 # -- runs
@@ -205,12 +207,12 @@ def rms_of_free(delay_ms: float) -> float:
     return float(np.sqrt(((made[..., :2] - made[..., 4:6]) ** 2).mean()))
 
 
-def seen(
-    name: str, asked: str, *windows: tuple[float, float, str], **changes: Any
+def measure_windows(
+    name: str, quantity: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
     """Returns quantities of windows of a run, window by window."""
     made = measured(name, keys(changes), *windows)
-    return [value(made, key, n) for n in range(len(windows)) for key in asked.split()]
+    return [value(made, key, n) for n in range(len(windows)) for key in quantity.split()]
 
 
 def age(**changes: Any) -> float:
@@ -360,10 +362,10 @@ LAB: dict[str, Make] = {
         edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
         edge("p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}),
     ],
-    "only the first decays: {} rad at 38 s": lambda: seen(
+    "only the first decays: {} rad at 38 s": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, "")
     ),
-    "against {} rad at a constant 200 ms": lambda: seen(
+    "against {} rad at a constant 200 ms": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, ""), **CONSTANT
     ),
     "the age in use is {} ms on average": lambda: [age()],
@@ -379,28 +381,30 @@ LAB: dict[str, Make] = {
     "V falls from {} to {} J": lambda: lyapunov().V[[0, -1]],
     "With ones it rises by {} of {} J": lambda: rise(lyapunov(ones=True).V),
     "ones still fail, by {} J": lambda: rise(lyapunov(True, **EQUAL_KD).V)[:1],
-    "At 20 ms one hit, then {} N.": lambda: seen(
+    "At 20 ms one hit, then {} N.": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), link__delay_ms=20.0
     ),
-    "{} +- {} N, peaks of {} N": lambda: seen(
+    "{} +- {} N, peaks of {} N": lambda: measure_windows(
         "contact", "wall_mean_n wall_deviation_n wall_peak_n", (9, 15, "s")
     ),
-    "A fifth of the force settles at {} N": lambda: seen(
+    "A fifth of the force settles at {} N": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), sites__m__control__k_f=0.2
     ),
-    "integrate it: {} N at 6 s, {} N at 10 s, {} N at 20 s, {} N at 59 s": lambda: seen(
-        "windup", "wall_mean_n", *[(t - 0.1, t + 0.1, "s") for t in (6, 10, 20, 59)]
+    "integrate it: {} N at 6 s, {} N at 10 s, {} N at 20 s, {} N at 59 s": lambda: (
+        measure_windows(
+            "windup", "wall_mean_n", *[(t - 0.1, t + 0.1, "s") for t in (6, 10, 20, 59)]
+        )
     ),
-    "With gravity known it stays at {} N": lambda: seen(
+    "With gravity known it stays at {} N": lambda: measure_windows(
         "windup", "wall_mean_n", (58.9, 59.1, "s"), control__Gamma=[1.0, 1.0, 1.0, 0.0, 0.0]
     ),
     "feels 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[0], 5 * p[2] / p[0]],
     "trainee 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[1], 5 * p[2] / p[1]],
     "torques with it: {} rad/s and {} N m, where {} N m": lambda: [
-        *seen("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
-        *seen("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
+        *measure_windows("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
+        *measure_windows("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
     ],
-    "smoothly takes {} N m": lambda: seen(
+    "smoothly takes {} N m": lambda: measure_windows(
         "outage", "torque_peak_nm", (6, 15, "s"), on_stale__action="hold"
     ),
     "from the link, {} and {} J at 6.2 s": energy_of_healing,
@@ -515,20 +519,22 @@ ROWS = [
 ]
 
 
-def numbers(words: str, text: str) -> list[str]:
+def numbers(phrase: str, text: str) -> list[str]:
     """Returns the numbers in the single place of a text that has these words."""
-    pattern = NUMBER.join(map(re.escape, words.split("{}")))
+    pattern = NUMBER.join(map(re.escape, phrase.split("{}")))
     matches = re.findall(pattern, " ".join(text.split()))
     assert len(matches) == 1, f"{len(matches)} places"
     return [matches[0]] if isinstance(matches[0], str) else list(matches[0])
 
 
-def check(page: str, words: str, made: Numbers | str) -> None:
+def check(page: str, phrase: str, source: Numbers | str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     for word, plain in WORDS.items():
         text = text.replace(word, plain)
-    wanted = list(map(float, numbers(words, made))) if isinstance(made, str) else list(made)
-    printed = numbers(words, text)
+    wanted = (
+        list(map(float, numbers(phrase, source))) if isinstance(source, str) else list(source)
+    )
+    printed = numbers(phrase, text)
     digits = [
         10.0 ** (int(e or 0) - len(m.partition(".")[2]))
         for m, _, e in (p.partition("e") for p in printed)
@@ -540,9 +546,9 @@ def check(page: str, words: str, made: Numbers | str) -> None:
     assert not any(off), f"{printed} on the page, made: {wanted}"
 
 
-@pytest.mark.parametrize(("page", "words", "make"), ROWS)
-def test_page_numbers_equal_their_source(page: str, words: str, make: Make) -> None:
-    check(page, words, make())
+@pytest.mark.parametrize(("page", "phrase", "make"), ROWS)
+def test_page_numbers_equal_their_source(page: str, phrase: str, make: Make) -> None:
+    check(page, phrase, make())
 
 
 @pytest.mark.long
@@ -604,12 +610,12 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("told", AS_PRINTED)
-def test_printed_gains_repeat_the_page(told: str) -> None:
-    made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
+@pytest.mark.parametrize("statement", AS_PRINTED)
+def test_printed_gains_repeat_the_page(statement: str) -> None:
+    made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
     check(
         "docs/theory/fair-comparison-results.md",
-        f"| as printed{told} | {{}} | {{}} |",
+        f"| as printed{statement} | {{}} | {{}} |",
         [made.error_rad, made.effort_nm],
     )
 

@@ -166,7 +166,7 @@ def test_both_names_of_the_program_are_one() -> None:
     assert made == scripts["trilat"]
 
 
-def run(*words: object, cwd: Path, **more: str) -> str:
+def run(*arguments: object, cwd: Path, **more: str) -> str:
     """Runs a program outside of the checkout; returns its output."""
     bare = {
         key: value
@@ -174,7 +174,7 @@ def run(*words: object, cwd: Path, **more: str) -> str:
         if not key.startswith(("PYTHON", "VIRTUAL"))
     }
     done = subprocess.run(
-        [str(word) for word in words],
+        [str(word) for word in arguments],
         cwd=cwd,
         env={**bare, **more},
         capture_output=True,

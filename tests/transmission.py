@@ -100,6 +100,6 @@ def rightmost_root(
     return float(10.0 * np.roots(scaled[::-1]).real.max())
 
 
-def printed(value: float) -> Any:
+def approximate_printed(value: float) -> Any:
     """Returns an approximation of a printed number of three digits, within half of the last digit."""
     return pytest.approx(value, rel=2e-3, abs=6e-4)

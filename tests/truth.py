@@ -110,7 +110,7 @@ class Bound:
         return (event.bound_ns + later_ns * event.drift_bound_ppb / NS_PER_S) / 1000
 
 
-def judged(log: Log, site: str, peer: str) -> Judged:
+def judge_link(log: Log, site: str, peer: str) -> Judged:
     """Returns every sample of a link that its receiver echoed, against the truth."""
     clocks = members(log)
     place = log.scenario.peers(site).index(peer)

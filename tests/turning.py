@@ -120,10 +120,10 @@ def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
         site: [one.as_rotvec() for one in motion[:2]] for site, motion in motions.items()
     }
 
-    def record(found: Record) -> Record:
-        site, k = found["site"], min(found["tick"], RECORDS - 1)
+    def record(fields: Record) -> Record:
+        site, k = fields["site"], min(fields["tick"], RECORDS - 1)
         for field, vector in zip(("x", "q_des"), vectors[site], strict=True):
-            found[field] = [*found[field][:3], *vector[k].tolist()]
-        return {**found, "q": motions[site].q[k].tolist()}
+            fields[field] = [*fields[field][:3], *vector[k].tolist()]
+        return {**fields, "q": motions[site].q[k].tolist()}
 
     return opened(edited(_simulate(), record=record)), motions

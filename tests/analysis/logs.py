@@ -143,10 +143,10 @@ Sample = tuple[str, int, int]
 
 @cache
 def busy() -> Run:
-    return driven(parse_scenario(BUSY))
+    return drive_run(parse_scenario(BUSY))
 
 
-def driven(
+def drive_run(
     scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[Sample] = ()
 ) -> Run:
     """Returns a run with those `ORDERED` changes that fit, over a network that loses and

@@ -43,7 +43,7 @@ def chain_of(name: str, **drive: float) -> ChainArmRows:
     return ChainArmRows(theta, ChainSetup(joints, (0.0, 0.0, -9.81), chain.tip_origin_m))
 
 
-def drawn(joints: int, rows: int = 5) -> list[Array]:
+def draw_rows(joints: int, rows: int = 5) -> list[Array]:
     return list(np.random.default_rng(joints).normal(size=(4, rows, joints)))
 
 
@@ -74,7 +74,7 @@ def test_torque_inertia_gradient_and_tip_equal_pinocchios(name: str) -> None:
 def test_the_slope_of_the_potential_energy_is_gravity(name: str) -> None:
     arm = chain_of(name)
     n, step = len(arm.chain.joints), 1e-5
-    q = drawn(n, 1)[0]
+    q = draw_rows(n, 1)[0]
     poses = q + step * np.vstack([np.eye(n), -np.eye(n)])
     up, down = np.split(arm.potential_energy(poses), 2)
     np.testing.assert_allclose((up - down) / (2 * step), arm.gravity_torque(q)[0], atol=2e-8)
@@ -85,7 +85,7 @@ def test_friction_and_stops_equal_the_cores() -> None:
     drive = {"viscous": 0.4, "coulomb": 1.2}
     stop = {"lower": -0.5, "upper": 0.5, "stop_stiffness": 800.0, "stop_damping": 9.0}
     rough, smooth = chain_of("arm6", **drive, **stop), chain_of("arm6")
-    q, qd, torque, _ = drawn(6, 20)
+    q, qd, torque, _ = draw_rows(6, 20)
     qd[0] *= 1e-3  # within the smooth part of Coulomb's friction
     forces = []
     for arm in (rough, smooth):
@@ -106,7 +106,7 @@ def test_the_planar_arm_equals_its_chain() -> None:
     theta = build_arm(arm, Task(), {}, chains=False).theta
     plane = PlanarArmRows(theta, 9.81, (0.8, 0.6))
     chain = ChainArmRows(model.theta, model.chain)
-    q, qd, v, a = drawn(2)
+    q, qd, v, a = draw_rows(2)
     np.testing.assert_allclose(plane.gravity_torque(q), chain.gravity_torque(q), atol=1e-12)
     np.testing.assert_allclose(
         plane.multiply_inertia(q, a), chain.multiply_inertia(q, a), atol=1e-12
@@ -166,7 +166,7 @@ def test_base_parameters_omit_only_torque_free_combinations(name: str) -> None:
         assert np.abs(left).max() <= 1e-9 * (1.0 + np.abs(Yr).max())
     null = np.random.default_rng(3).normal(size=len(arm.theta))
     null -= B.T @ np.linalg.lstsq(B.T, null, rcond=None)[0]
-    q, qd, v, a = drawn(len(arm.chain.joints))
+    q, qd, v, a = draw_rows(len(arm.chain.joints))
     assert np.abs(arm.law_torque(null[np.newaxis], q, qd, v, a)).max() <= 1e-8
 
 

@@ -85,7 +85,7 @@ def test_superseded_samples_are_never_in_use():
 def test_lost_and_doubled_samples_are_counted():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
-    run = logs.driven(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
+    run = logs.drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
     link_uses = uses(run.log)
     lossy = link_uses["m2->m1"]
     assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
@@ -121,7 +121,7 @@ def test_samples_of_missing_records_have_no_fate():
 
 def test_a_link_cut_until_the_end_loses_everything():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
-    run = logs.driven(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
+    run = logs.drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
     cut = uses(run.log)["m2->m1"]
     assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
     assert cut.silence_ms == 1000.0 - (99 * 5.0 + 20.0)
@@ -132,7 +132,7 @@ def test_late_samples_equal_those_of_the_core():
     log = logs.simulated("free")
     hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
     assert hurried != log.scenario.text
-    run = logs.driven(parse_scenario(hurried))
+    run = logs.drive_run(parse_scenario(hurried))
     for use in summarise_links(run.log):
         assert use.counts.late == counted(run, use.name).late
 

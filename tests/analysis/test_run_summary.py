@@ -178,7 +178,7 @@ STATE = "/trilat/paper/m1/state"
 RATES = {"m1": 1000, "m2": 1000, "s": 1000}
 
 
-def written(folder: Path, data: bytes) -> Path:
+def write_log(folder: Path, data: bytes) -> Path:
     path = folder / "run.mcap"
     path.write_bytes(data)
     return path
@@ -188,7 +188,7 @@ def written(folder: Path, data: bytes) -> Path:
 @given(st.sets(st.integers(0, 119), max_size=100))
 def test_gaps_count_missing_records(tmp_path: Path, lost: set[int]) -> None:
     """Records missing behind the last one do not count, because no number reveals them."""
-    path = written(tmp_path, edited(WHOLE, record=without("m1", lost)))
+    path = write_log(tmp_path, edited(WHOLE, record=without("m1", lost)))
     facts = FileInventory([path]).channels("paper", RATES, {})[STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
@@ -212,7 +212,7 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
 
 def test_progress_covers_the_file_once(tmp_path: Path) -> None:
     told: list[float] = []
-    info(written(tmp_path, WHOLE), progress=lambda done, total: told.append(done / total))
+    info(write_log(tmp_path, WHOLE), progress=lambda done, total: told.append(done / total))
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.5 < told[-1] <= 1.0
 

@@ -590,10 +590,11 @@ class Truth(NamedTuple):
 
 
 def find_truth(drawn: Drawn) -> Truth:
-    """The truth by the rightmost root and by a run eight times as long, in which operators let go.
+    """Returns the truth by the rightmost root and by a run eight times as long, in which
+    operators let go.
 
-    Of random links the longer run alone decides.
-    See `find_wide_truth` for whatever was drawn widely.
+    For random links the longer run alone decides. `find_wide_truth` decides for widely drawn
+    runs.
     """
     if drawn.wide:
         return find_wide_truth(drawn.scenario)

@@ -138,20 +138,30 @@ def judge(scenario: Scenario) -> list[Statement]:
     return statements
 
 
-def disagree(one: Statement, other: Statement) -> str:
+def disagree(statement: Statement, other: Statement) -> str:
     """Returns in which way two commands disagree about a run. Empty if they agree."""
-    both = f"{one}, {other}"
-    if one.word and other.word and (one.word, one.rests_on) != (other.word, other.rests_on):
+    both = f"{statement}, {other}"
+    if (
+        statement.word
+        and other.word
+        and (statement.word, statement.rests_on) != (other.word, other.rests_on)
+    ):
         return f"words: {both}"
-    if one.roots and other.roots and one.roots != other.roots:
+    if statement.roots and other.roots and statement.roots != other.roots:
         return f"verdicts on small motions: {both}"
-    if one.rate_per_s is not None and other.rate_per_s is not None:
-        tolerance_per_s = SAME_RATE * (1.0 + abs(one.rate_per_s))
-        if abs(one.rate_per_s - other.rate_per_s) > tolerance_per_s:
+    if statement.rate_per_s is not None and other.rate_per_s is not None:
+        tolerance_per_s = SAME_RATE * (1.0 + abs(statement.rate_per_s))
+        if abs(statement.rate_per_s - other.rate_per_s) > tolerance_per_s:
             return f"rates: {both}"
-    if one.pushes is not None and other.pushes is not None and one.pushes != other.pushes:
+    if (
+        statement.pushes is not None
+        and other.pushes is not None
+        and statement.pushes != other.pushes
+    ):
         return f"pushes: {both}"
-    if (one.says_stable and other.says_unstable) or (one.says_unstable and other.says_stable):
+    if (statement.says_stable and other.says_unstable) or (
+        statement.says_unstable and other.says_stable
+    ):
         return f"contradiction: {both}"
     return ""
 

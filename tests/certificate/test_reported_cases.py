@@ -73,24 +73,24 @@ def certify_case(case: Case) -> Certificate:
     return tn.certify(tn.simulate(case.loop.write_scenario(case.duration_s, case.apart_rad)))
 
 
-def assert_roots_decide(found: Certificate, rate_per_s: float) -> None:
+def assert_roots_decide(certificate: Certificate, rate_per_s: float) -> None:
     """Asserts that a verdict rests on exact roots with a rate, and that it is right.
 
     Args:
         found: The certificate of a run.
         rate_per_s: True rate of the slowest motion, in 1/s.
     """
-    assert found.roots is not None
-    assert found.roots.exact
-    assert found.roots.rate_per_s == pytest.approx(rate_per_s, abs=5e-5)
+    assert certificate.roots is not None
+    assert certificate.roots.exact
+    assert certificate.roots.rate_per_s == pytest.approx(rate_per_s, abs=5e-5)
     if rate_per_s > 0.0:
-        assert found.stability is Stability.NOT_STABLE
-        assert found.decision.rests_on.startswith("exact roots, fastest growing +")
-        assert found.roots.text in found.reasons
+        assert certificate.stability is Stability.NOT_STABLE
+        assert certificate.decision.rests_on.startswith("exact roots, fastest growing +")
+        assert certificate.roots.text in certificate.reasons
     else:
-        assert found.stability is Stability.STABLE
-        assert "exact roots, slowest -" in found.decision.rests_on
-        assert found.reasons == ()
+        assert certificate.stability is Stability.STABLE
+        assert "exact roots, slowest -" in certificate.decision.rests_on
+        assert certificate.reasons == ()
 
 
 @pytest.mark.parametrize(

@@ -55,11 +55,11 @@ def whole_command() -> Any:
     return get_command(app)
 
 
-def parses(words: list[str]) -> None:
+def parses(arguments: list[str]) -> None:
     """Asserts that a command line, `trilat` included, names a command, and only options and
     arguments of that command.
     """
-    program, *rest = words
+    program, *rest = arguments
     assert program == "trilat"
     command: Any = whole_command()
     while hasattr(command, "commands"):

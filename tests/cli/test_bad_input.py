@@ -270,12 +270,12 @@ TAKING = {
 }
 
 
-@pytest.mark.parametrize("words", TAKING.values(), ids=TAKING)
+@pytest.mark.parametrize("arguments", TAKING.values(), ids=TAKING)
 def test_refusals_of_odd_words_hide_control_characters(
-    words: list[str], tmp_path: Path
+    arguments: list[str], tmp_path: Path
 ) -> None:
     for odd in ODD:
-        done = trilat(*(word.replace("{}", odd) for word in words), cwd=tmp_path)
+        done = trilat(*(word.replace("{}", odd) for word in arguments), cwd=tmp_path)
         done.refuses()
         assert done.err[:-1].isprintable()
         assert len(done.err) < 4100

@@ -54,7 +54,7 @@ def test_the_list_names_impossible_figures(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "facts"),
+    ("arguments", "facts"),
     [
         (["contact"], ["no site has a wall"]),
         (["phase", "--format", ","], ["--format is empty"]),
@@ -62,6 +62,6 @@ def test_the_list_names_impossible_figures(folder: Path) -> None:
     ],
 )
 def test_impossible_figures_are_refused(
-    folder: Path, words: list[str], facts: list[str]
+    folder: Path, arguments: list[str], facts: list[str]
 ) -> None:
-    trilat("figure", "run.mcap", *words, cwd=folder).refuses(*facts)
+    trilat("figure", "run.mcap", *arguments, cwd=folder).refuses(*facts)

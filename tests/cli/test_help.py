@@ -36,7 +36,7 @@ COMMANDS = [
 
 
 @cache
-def printed(*arguments: str) -> str:
+def print_help(*arguments: str) -> str:
     result = CliRunner().invoke(
         app, list(arguments), env={"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "200"}
     )
@@ -48,8 +48,8 @@ def printed(*arguments: str) -> str:
 def test_commands_have_help_examples_and_explained_options(
     command: list[str],
 ) -> None:
-    text = printed(*command, "-h")
-    assert text == printed(*command, "--help")
+    text = print_help(*command, "-h")
+    assert text == print_help(*command, "--help")
     assert re.search(f"Example: trilat {'.* '.join(command)}", text)
     for line in text.splitlines():
         option = re.match(r"[│| ]*(--[a-z-]+)", line)
@@ -68,12 +68,12 @@ def test_commands_have_help_examples_and_explained_options(
 
 
 def test_the_main_help_names_first_steps() -> None:
-    assert "trilat demo paper" in printed("--help")
+    assert "trilat demo paper" in print_help("--help")
 
 
 def test_the_main_help_has_six_panels() -> None:
     panels: dict[str, list[str]] = {}
-    for line in printed("--help").splitlines():
+    for line in print_help("--help").splitlines():
         if title := re.match(r"╭─ (.+?) ─+╮", line):
             panels[title[1]] = []
         elif command := re.match(r"│ ([a-z]\S*) ", line):
@@ -87,7 +87,7 @@ def test_the_main_help_has_six_panels() -> None:
 
 @pytest.mark.parametrize("name", sorted({name.split()[0] for name in NAMES}))
 def test_purposes_fit_one_line_of_main_help(name: str) -> None:
-    (line,) = re.findall(rf"^│ {name} +(.+?) +│$", printed("--help"), re.MULTILINE)
+    (line,) = re.findall(rf"^│ {name} +(.+?) +│$", print_help("--help"), re.MULTILINE)
     assert len(line) <= 64
     assert re.fullmatch(r"[A-Z].*[.?]", line)
     assert ". " not in line
@@ -96,7 +96,7 @@ def test_purposes_fit_one_line_of_main_help(name: str) -> None:
 @pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
 def test_help_ends_with_an_example_and_page(command: str) -> None:
     *_, example, page = (
-        line for line in printed(*command.split(), "-h").splitlines() if line.strip()
+        line for line in print_help(*command.split(), "-h").splitlines() if line.strip()
     )
     assert example.split()[0] == "Example:"
     assert page.startswith(" Docs: ")
@@ -117,7 +117,7 @@ def test_help_starts_with_one_sentence(command: str) -> None:
 def test_help_lists_all_tunable_laws() -> None:
     listed = {*list_laws(), "known"}
     assert listed == set(SEARCH_SPACES)
-    words = " ".join(re.sub("[│|]", " ", printed("compare", "--help")).split())
+    words = " ".join(re.sub("[│|]", " ", print_help("compare", "--help")).split())
     assert all(re.search(rf"\b{law}\b", words) for law in listed)
 
 
@@ -127,7 +127,7 @@ def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
     (tmp_path / "run.mcap").rename(tmp_path / "logs" / "one.mcap")
     for command in COMMANDS:
-        text = printed(*command, "--help")
+        text = print_help(*command, "--help")
         if "MCAP log" not in text or command[0] in ("record", "identify"):
             continue
         accepts = "folders with MCAP logs" in text
@@ -146,7 +146,7 @@ def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:
 
 
 def test_export_help_names_every_format_and_setting() -> None:
-    text = " ".join(printed("log", "export", "--help").replace("│", " ").split())
+    text = " ".join(print_help("log", "export", "--help").replace("│", " ").split())
     for form in list_export_formats():
         module = import_module(f"trilat_net.presentation.exports.{form}")
         assert form in text

@@ -16,7 +16,7 @@ from trilat_net.presentation.untrusted_text import sanitize
 WHOLE = recorded("paper")
 
 
-def written(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
+def write_log(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
     path = folder / name
     path.write_bytes(data)
     return path
@@ -36,7 +36,7 @@ def foreign() -> bytes:
 
 
 def test_info_shows_session_sites_links_and_channels(tmp_path: Path) -> None:
-    text = trilat("log", "info", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
+    text = trilat("log", "info", write_log(tmp_path, WHOLE), cwd=tmp_path).succeeds()
     for fact in (
         "paper, virtual",
         "seed 1",
@@ -52,7 +52,7 @@ def test_info_shows_session_sites_links_and_channels(tmp_path: Path) -> None:
 
 
 def test_info_in_json_has_the_same_numbers(tmp_path: Path) -> None:
-    path = written(tmp_path, edited(WHOLE, record=without("m1", {5, 6, 90})))
+    path = write_log(tmp_path, edited(WHOLE, record=without("m1", {5, 6, 90})))
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "trilat"
     assert facts["session"]["scenario"]["name"] == "paper"
@@ -68,7 +68,7 @@ def test_info_in_json_has_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_info_of_a_foreign_file_shows_channels(tmp_path: Path) -> None:
-    path = written(tmp_path, foreign())
+    path = write_log(tmp_path, foreign())
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "mcap"
     assert facts["session"] is None
@@ -78,7 +78,7 @@ def test_info_of_a_foreign_file_shows_channels(tmp_path: Path) -> None:
 
 
 def test_info_of_an_unreadable_log_gives_reasons(tmp_path: Path) -> None:
-    path = written(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
+    path = write_log(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
     text = trilat("log", "info", path, cwd=tmp_path).succeeds()
     assert "cannot be opened" in text
     assert "is not TOML" in text
@@ -86,12 +86,12 @@ def test_info_of_an_unreadable_log_gives_reasons(tmp_path: Path) -> None:
 
 
 def test_a_sound_log_passes_every_check(tmp_path: Path) -> None:
-    text = trilat("log", "check", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
+    text = trilat("log", "check", write_log(tmp_path, WHOLE), cwd=tmp_path).succeeds()
     assert [line.split()[0] for line in text.splitlines()] == ["ok"] * 11
 
 
 def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
-    path = written(tmp_path, edited(WHOLE, record=without("s", {7, 8, 9, 40})))
+    path = write_log(tmp_path, edited(WHOLE, record=without("s", {7, 8, 9, 40})))
     done = trilat("log", "check", path, cwd=tmp_path)
     assert done.code == 1
     assert "FAIL sequence" in done.out
@@ -106,7 +106,7 @@ def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
 
 
 def test_foreign_mcap_files_are_checked_for_structure(tmp_path: Path) -> None:
-    done = trilat("log", "check", written(tmp_path, foreign()), cwd=tmp_path)
+    done = trilat("log", "check", write_log(tmp_path, foreign()), cwd=tmp_path)
     assert done.code == 0
     assert len(done.out.splitlines()) == 4
     assert "not a trilat-net log" in done.err
@@ -115,7 +115,7 @@ def test_foreign_mcap_files_are_checked_for_structure(tmp_path: Path) -> None:
 def test_missing_and_foreign_files_are_refused_or_fail(tmp_path: Path) -> None:
     for command in ("info", "check"):
         trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
-    path = written(tmp_path, b"text")
+    path = write_log(tmp_path, b"text")
     trilat("log", "info", path, cwd=tmp_path).refuses("is not an MCAP file")
     assert trilat("log", "check", path, cwd=tmp_path).code == 1
 
@@ -125,7 +125,7 @@ def test_missing_and_foreign_files_are_refused_or_fail(tmp_path: Path) -> None:
 )
 def test_every_command_names_the_repair(command: list[str], tmp_path: Path) -> None:
     data = edited(WHOLE, chunk_bytes=4096)
-    path = written(tmp_path, data[: len(data) // 2], "run.mcap.active")
+    path = write_log(tmp_path, data[: len(data) // 2], "run.mcap.active")
     done = trilat(*command, path, cwd=tmp_path)
     notes = [line for line in done.err.splitlines() if line.startswith("note: ")]
     assert len(notes) == 1, done
@@ -134,7 +134,7 @@ def test_every_command_names_the_repair(command: list[str], tmp_path: Path) -> N
 
 def test_verify_names_every_gap_and_continues(tmp_path: Path) -> None:
     lost = {3 * n for n in range(10, 30)}
-    path = written(tmp_path, edited(WHOLE, record=without("m2", lost)))
+    path = write_log(tmp_path, edited(WHOLE, record=without("m2", lost)))
     done = trilat("verify", path, cwd=tmp_path)
     assert done.code == 1, done  # nothing differs, and too much is missing
     assert f"m2 {', '.join(map(str, sorted(lost)))}" in done.out
@@ -153,7 +153,7 @@ def test_file_contents_reach_terminals_only_escaped(tmp_path: Path) -> None:
     """An escape sequence in a name could clear the screen, or write text that was never there."""
     assert sanitize("\x1b[2Jred\r\n") == "\ufffd[2Jred\ufffd\ufffd"
     assert len(sanitize("x" * 10_000)) < 400
-    path = written(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
+    path = write_log(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
     done = trilat("log", "info", path, cwd=tmp_path)
     assert "\x1b" not in done.out + done.err
     assert "\x07" not in done.out + done.err
@@ -172,10 +172,10 @@ READING = (
 )
 
 
-@pytest.mark.parametrize("words", READING, ids=" ".join)
-def test_an_empty_file_is_empty_to_every_command(words: list[str], tmp_path: Path) -> None:
-    written(tmp_path, b"", "empty.mcap")
-    done = trilat(*words, "empty.mcap", cwd=tmp_path)
+@pytest.mark.parametrize("arguments", READING, ids=" ".join)
+def test_an_empty_file_is_empty_to_every_command(arguments: list[str], tmp_path: Path) -> None:
+    write_log(tmp_path, b"", "empty.mcap")
+    done = trilat(*arguments, "empty.mcap", cwd=tmp_path)
     assert done.code != 0
     assert "is empty" in done.out + done.err
     assert "trilat log recover" not in done.out + done.err  # it could save nothing
@@ -184,7 +184,7 @@ def test_an_empty_file_is_empty_to_every_command(words: list[str], tmp_path: Pat
 
 def test_trailing_bytes_lose_nothing(tmp_path: Path) -> None:
     data = PADDED.read_bytes()
-    written(tmp_path, data, "padded.mcap")
+    write_log(tmp_path, data, "padded.mcap")
     for words in (["log", "info"], ["log", "check"]):
         done = trilat(*words, "padded.mcap", cwd=tmp_path)
         assert "was finished, and 512 bytes follow its end mark" in done.err, done
@@ -199,7 +199,7 @@ def test_trailing_bytes_lose_nothing(tmp_path: Path) -> None:
 
 
 def test_a_padded_log_is_verified(tmp_path: Path) -> None:
-    written(tmp_path, WHOLE + bytes(4096))
+    write_log(tmp_path, WHOLE + bytes(4096))
     for words in (["log", "info"], ["verify"]):
         done = trilat(*words, "run.mcap", cwd=tmp_path)
         assert done.code == 0, done
@@ -213,7 +213,7 @@ def without_ends(payload: bytes) -> bytes:
 
 
 def test_an_unknown_end_is_reported_everywhere(tmp_path: Path) -> None:
-    written(tmp_path, edited(WHOLE, event=without_ends))
+    write_log(tmp_path, edited(WHOLE, event=without_ends))
     sentence = "the end of m1, m2 and s is unknown"
     for words in (["log", "info"], ["log", "check"], ["verify"]):
         done = trilat(*words, "run.mcap", cwd=tmp_path)

@@ -83,9 +83,9 @@ WORKING = [
 ]
 
 
-@pytest.mark.parametrize(("words", "line"), WORKING, ids=lambda value: str(value[0]))
+@pytest.mark.parametrize(("arguments", "line"), WORKING, ids=lambda value: str(value[0]))
 def test_progress_off_terminals_goes_to_stderr(
-    words: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulated(tmp_path, "paper", seconds="0.2")
 
@@ -95,7 +95,7 @@ def test_progress_off_terminals_goes_to_stderr(
         yield lambda _done, _total: None
 
     monkeypatch.setattr(terminal_output, "progress_lines", announce)
-    done = trilat(*words, cwd=tmp_path)
+    done = trilat(*arguments, cwd=tmp_path)
     assert line in done.err
     assert json.loads(done.out)
 

@@ -24,10 +24,10 @@ WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE
 
 
 def limited(
-    kind: int, most: int, *words: str | Path, cwd: Path
+    kind: int, most: int, *arguments: str | Path, cwd: Path
 ) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
-        [*COMMAND, *map(str, words)],
+        [*COMMAND, *map(str, arguments)],
         cwd=cwd,
         env=WITHOUT_COMPILING,
         capture_output=True,
@@ -70,11 +70,13 @@ def test_keys_refused_by_disk_leave_no_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mib", "words"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))]
+    ("mib", "arguments"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))]
 )
-def test_too_little_memory_is_one_line(mib: int, words: Sequence[str], tmp_path: Path) -> None:
+def test_too_little_memory_is_one_line(
+    mib: int, arguments: Sequence[str], tmp_path: Path
+) -> None:
     """With `ulimit -v` libraries cannot be loaded, or retry for ever."""
-    done = limited(resource.RLIMIT_AS, mib << 20, *words, LOG, cwd=tmp_path)
+    done = limited(resource.RLIMIT_AS, mib << 20, *arguments, LOG, cwd=tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "error: there is too little memory" in done.stderr
@@ -109,7 +111,7 @@ def test_recovering_blames_the_unwritable_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ("scenario", "check"),
         ("trace", "import", "irtt"),
@@ -122,7 +124,7 @@ def test_recovering_blames_the_unwritable_file(tmp_path: Path) -> None:
     ids=" ".join,
 )
 def test_contents_of_foreign_files_are_not_repeated(
-    words: tuple[str, ...], tmp_path: Path
+    arguments: tuple[str, ...], tmp_path: Path
 ) -> None:
     """The reader of the error may not be allowed to read that file."""
     for text in (
@@ -132,8 +134,8 @@ def test_contents_of_foreign_files_are_not_repeated(
         "t_s,delay_ms\nsecret,1\n",
     ):
         (tmp_path / "foreign").write_text(text)
-        more = ("-o", "made.csv") if words[0] == "trace" else ()
-        done = trilat(*words, "foreign", *more, cwd=tmp_path)
+        more = ("-o", "made.csv") if arguments[0] == "trace" else ()
+        done = trilat(*arguments, "foreign", *more, cwd=tmp_path)
         assert done.code == 2, done
         assert "foreign" in done.err
         assert "secret" not in done.err + done.out
@@ -143,15 +145,15 @@ def test_contents_of_foreign_files_are_not_repeated(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
 )
 @pytest.mark.parametrize(
-    "words", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
+    "arguments", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
 )
 def test_cold_starts_say_they_compile_and_stop(
-    words: tuple[str, ...], number: signal.Signals, tmp_path: Path
+    arguments: tuple[str, ...], number: signal.Signals, tmp_path: Path
 ) -> None:
     """Python handles a signal between two instructions, and one call of the compiler takes minutes."""
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     started = subprocess.Popen(
-        [*COMMAND, *words], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True
+        [*COMMAND, *arguments], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True
     )
     assert started.stderr is not None
     try:

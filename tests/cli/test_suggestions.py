@@ -21,7 +21,7 @@ def in_one_line(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("words", "suggestion"),
+    ("arguments", "suggestion"),
     [
         (["simulate", "paper"], "trilat sim?"),
         (["run"], "trilat sim or trilat demo?"),
@@ -35,9 +35,9 @@ def in_one_line(text: str) -> str:
     ],
 )
 def test_an_unknown_command_suggests_one(
-    words: list[str], suggestion: str, tmp_path: Path
+    arguments: list[str], suggestion: str, tmp_path: Path
 ) -> None:
-    done = trilat(*words, cwd=tmp_path)
+    done = trilat(*arguments, cwd=tmp_path)
     assert done.code == 2
     assert f"did you mean {suggestion}" in in_one_line(done.err)
 
@@ -124,7 +124,7 @@ def test_a_setting_split_by_the_shell_needs_quotes(
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ["--set", "control.Kd=5", "--set", "control.Kp=1"],
         ["--set", "control.Kd=[3, 4]", "free"],
@@ -133,8 +133,8 @@ def test_a_setting_split_by_the_shell_needs_quotes(
         ["--set", "no form"],
     ],
 )
-def test_whole_settings_stay_unchanged(words: list[str]) -> None:
-    assert find_split_setting(words) == ""
+def test_whole_settings_stay_unchanged(arguments: list[str]) -> None:
+    assert find_split_setting(arguments) == ""
 
 
 def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def test_the_version_is_that_of_the_package() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "found"),
+    ("phrase", "found"),
     [
         ("sim tw", {"two_sites"}),
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
@@ -63,12 +63,12 @@ def test_the_version_is_that_of_the_package() -> None:
         pytest.param(f"twin {GOLDEN_LOG} --push m", {"m1", "m2"}, marks=pytest.mark.long),
     ],
 )
-def test_shells_complete_commands(words: str, found: set[str]) -> None:
+def test_shells_complete_commands(phrase: str, found: set[str]) -> None:
     asked = {"_TRILAT_COMPLETE": "complete_fish", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
     code = "from trilat_net.app.cli import app; app(prog_name='trilat')"
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={**PLAIN, **asked, "_TYPER_COMPLETE_ARGS": f"trilat {words}"},
+        env={**PLAIN, **asked, "_TYPER_COMPLETE_ARGS": f"trilat {phrase}"},
         capture_output=True,
         text=True,
     )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.energy_runs import JITTER, LAWS, MOBILE, drawn, least_energy, pair, ticked
+from tests.energy_runs import JITTER, LAWS, MOBILE, draw_energy_run, least_energy, pair, ticked
 from tests.log_editing import opened
 from tests.unit_arm import H50, hand, unit_scenario
 from tests.virtual_runs import sampled, trajectories
@@ -106,7 +106,7 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
 )
 def test_drawn_runs_never_have_negative_energy(law: str, seeds: range) -> None:
     """Half lost, 4g, jitter; contact and pushes; ramps of dominance; drift compensation is on."""
-    least = {seed: least_energy(ticked(drawn(law, seed))) for seed in seeds}
+    least = {seed: least_energy(ticked(draw_energy_run(law, seed))) for seed in seeds}
     assert {seed: one for seed, one in least.items() if one < -1e-9} == {}
 
 

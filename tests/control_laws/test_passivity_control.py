@@ -50,7 +50,7 @@ def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any
     )
 
 
-def felt(result: Any) -> float:
+def find_felt_stiffness(result: Any) -> float:
     return float(abs(result["m"].tau_x[-1, 0] / result["m"].q[-1, 0]))
 
 
@@ -59,7 +59,7 @@ def test_without_controllers_the_channel_is_active() -> None:
     free = watching(50.0, clamped=False)
     assert free["s"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert least_energy(free) == pytest.approx(-3.3e-3, abs=5e-5)
-    assert felt(watching(50.0, clamped=True)) == pytest.approx(90.91, abs=5e-3)
+    assert find_felt_stiffness(watching(50.0, clamped=True)) == pytest.approx(90.91, abs=5e-3)
     fast = watching(200.0, clamped=False)["m"].qd[:, 0]
     assert np.abs(fast).max() > 50.0
 
@@ -84,9 +84,9 @@ def test_free_motion_drifts_unless_drift_is_paid_for(
 
 def test_contact_stays_bounded() -> None:
     near, far = run(50.0, clamped=True), run(200.0, clamped=True)
-    assert felt(near) == pytest.approx(68.88, rel=1e-3)
+    assert find_felt_stiffness(near) == pytest.approx(68.88, rel=1e-3)
     # it chatters: the last digits are the integrator's
-    assert felt(far) == pytest.approx(26.7, rel=0.04)
+    assert find_felt_stiffness(far) == pytest.approx(26.7, rel=0.04)
     assert np.abs(far["m"].qd[-100:, 0]).max() < 0.03
     assert least_energy(near) >= -1e-15
     assert least_energy(far) >= -1e-15

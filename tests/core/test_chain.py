@@ -34,7 +34,7 @@ def build(name: str, **drive: float) -> Arm:
     )
 
 
-def apart(got: Array, wanted: Array) -> float:
+def largest_difference(got: Array, wanted: Array) -> float:
     return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
 
 
@@ -45,9 +45,12 @@ def test_inverse_dynamics_and_gradient_are_those_of_pinocchio(name: str) -> None
     gradient = np.zeros(LINK_PARAMETERS * len(arm.rows))
     for state in REFERENCES[name].states:
         moving(arm, state, state.v)
-        assert apart(torque_for(arm, state.v, state.a), state.inverse_dynamics) <= 1e-12
+        assert (
+            largest_difference(torque_for(arm, state.v, state.a), state.inverse_dynamics)
+            <= 1e-12
+        )
         parameter_gradient(arm.rows, gradient)
-        assert apart(gradient, state.regressor_transpose_r) <= 1e-12
+        assert largest_difference(gradient, state.regressor_transpose_r) <= 1e-12
 
 
 @each
@@ -58,7 +61,7 @@ def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         M = full_matrix(arm)
-        assert apart(M, state.inertia) <= 1e-12
+        assert largest_difference(M, state.inertia) <= 1e-12
         find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
         wanted = state.forward_dynamics
         assert (
@@ -72,17 +75,19 @@ def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         assert (
-            apart(
+            largest_difference(
                 np.array(place_end_effector(arm.rows, chain.tip_origin_m)), state.tip_position
             )
             <= 1e-12
         )
         assert (
-            apart(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian)
+            largest_difference(
+                np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian
+            )
             <= 1e-12
         )
         rotation = arm.rows["R_base"][-1] @ np.array(chain.tip_rotation)
-        assert apart(rotation, state.tip_rotation) <= 1e-12
+        assert largest_difference(rotation, state.tip_rotation) <= 1e-12
 
 
 def test_friction_and_drives_enter_both_dynamics_alike() -> None:
@@ -92,7 +97,7 @@ def test_friction_and_drives_enter_both_dynamics_alike() -> None:
     moving(arm, state, state.qd)
     torque = torque_for(arm, state.qd, state.a)
     find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, torque, qdd)
-    assert apart(qdd, state.a) <= 1e-11
+    assert largest_difference(qdd, state.a) <= 1e-11
 
 
 def stop_torque(q: list[float], qd: list[float]) -> Array:

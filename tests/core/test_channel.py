@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.channels import SEEDS, Ints, channel, due, stamps
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.links.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
@@ -268,7 +268,7 @@ for name in KINDS:
 
 @pytest.mark.long
 def test_uncompiled_draws_and_fates_have_equal_bits() -> None:
-    plain = printed(_PROGRAM, compiled=False)
+    plain = run_program(_PROGRAM, compiled=False)
     assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)
     assert plain.count("[") == len(KINDS)
-    assert plain == printed(_PROGRAM, compiled=True)
+    assert plain == run_program(_PROGRAM, compiled=True)

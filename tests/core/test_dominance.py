@@ -113,7 +113,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "own", "words"),
+    ("row", "own", "phrase"),
     [
         ([0.2, 0.8, 0.0], 0, "does not follow itself"),
         ([0.0, 1.5, -0.5], 0, "between 0 and 1"),
@@ -122,7 +122,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
         ([0.0, np.inf, 0.5], 0, "finite"),
     ],
 )
-def test_an_invalid_row_gives_the_reason(row: list[float], own: int, words: str) -> None:
+def test_an_invalid_row_gives_the_reason(row: list[float], own: int, phrase: str) -> None:
     fault = find_row_problem(np.array(row), own)
     assert fault is not None
-    assert words in fault
+    assert phrase in fault

@@ -116,7 +116,7 @@ def moving(k: int) -> Arrival:
     return Arrival(1, k - 1, (0.5e-3 * (k - 1), 0.0), (0.5, 0.0))
 
 
-def ran(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
+def run_site(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
     return stepped(
         made, [TickInput(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)]
     )
@@ -124,7 +124,7 @@ def ran(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
 
 def test_references_follow_changing_shares() -> None:
     """Eq. (6) with shares that change: the derivative contains their rates."""
-    outputs = ran(site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
+    outputs = run_site(site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     t_s = np.arange(3000) / 1000
     a = np.clip(0.9 - 0.8 * (t_s - 1), 0.1, 0.9)
@@ -138,8 +138,8 @@ def test_references_follow_changing_shares() -> None:
 
 def test_a_command_equals_the_scripted_ramp() -> None:
     ramp = DominanceRamp(S, 2 * S, (0.1, 0.9))
-    commanded = ran(site(), {700: [CoreChange("shares", ramp=ramp)]})
-    scripted = ran(site((ramp,)), {})
+    commanded = run_site(site(), {700: [CoreChange("shares", ramp=ramp)]})
+    scripted = run_site(site((ramp,)), {})
     assert [o._replace(cmd=[]) for o in commanded] == scripted
     assert commanded[700].cmd == ["shares"]
 
@@ -147,7 +147,7 @@ def test_a_command_equals_the_scripted_ramp() -> None:
 def test_earlier_commands_precede_planned_ramps() -> None:
     """Later ramps of the scenario still take place."""
     planned, sooner = DominanceRamp(2 * S, 2 * S, (0.0, 1.0)), DominanceRamp(S, S, (0.5, 0.5))
-    outputs = ran(site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
+    outputs = run_site(site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
     assert [outputs[k].q_des[1] for k in (999, 1000, 1999, 2000)] == [-0.9, -0.5, -0.5, 0.0]
 
 
@@ -166,8 +166,8 @@ def test_each_ramp_begins_where_the_last_was() -> None:
         start_ns, share = (7 * n + 100) * 1_000_000, 0.5 + 0.4 * math.sin(0.1 * n)
         ramps.append(DominanceRamp(start_ns, start_ns + 500_000_000, (share, 1.0 - share)))
     orders = {7 * n: [CoreChange("", ramp=ramp)] for n, ramp in enumerate(ramps)}
-    commanded = ran(site(), orders)
-    assert [o._replace(cmd=[]) for o in commanded] == ran(site(tuple(ramps)), {})
+    commanded = run_site(site(), orders)
+    assert [o._replace(cmd=[]) for o in commanded] == run_site(site(tuple(ramps)), {})
     assert 7 * len(orders) < 3000
 
 

@@ -120,15 +120,15 @@ def test_hand_at_tip_is_spring_in_plane(q: Array, K: Pair, target: Pair) -> None
     assert torque(1.0, q, still(q), hand) == pytest.approx(downhill(potential, q), abs=1e-4)
 
 
-@given(q=angles, K=st.floats(0, 1000), place=pairs, direction=st.floats(-4, 4))
+@given(q=angles, K=st.floats(0, 1000), point=pairs, direction=st.floats(-4, 4))
 def test_a_wall_is_a_spring_on_one_side(
-    q: Array, K: float, place: Pair, direction: float
+    q: Array, K: float, point: Pair, direction: float
 ) -> None:
     normal = (math.cos(direction), math.sin(direction))
-    wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=place, b=normal)
+    wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=point, b=normal)
 
     def potential(at: Array) -> float:
-        return float(0.5 * K * max(0.0, (np.array(place) - tip(at)) @ normal) ** 2)
+        return float(0.5 * K * max(0.0, (np.array(point) - tip(at)) @ normal) ** 2)
 
     expected = downhill(potential, q)
     assert torque(1.0, q, still(q), wall) == pytest.approx(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 
 SYMBOLS = """
 import numba, numpy as np
@@ -25,7 +25,8 @@ def test_symbols_of_leaves_separate_layouts() -> None:
     """With Numba's numbering, the first layouts of all processes would have equal symbols."""
     one, other = (
         dict(
-            line.split() for line in printed(SYMBOLS.format(order), compiled=True).splitlines()
+            line.split()
+            for line in run_program(SYMBOLS.format(order), compiled=True).splitlines()
         )
         for order in ((6, 7), (7, 6))
     )

@@ -29,7 +29,7 @@ from trilat_net.scenario.run_changes import LinkTables, resolve_change
 MIB = 2**20
 
 
-def taken(arrays: SiteArrays) -> int:
+def count_link_bytes(arrays: SiteArrays) -> int:
     """Returns the bytes that all links of a site take for samples and their times."""
     waiting = 0 if arrays.channel is None else arrays.channel.waiting.nbytes
     return arrays.dues.nbytes + arrays.calendars.nbytes + waiting
@@ -57,8 +57,8 @@ def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
         for name in scenario.names:
             setup = scenario.setup(name)
             arrays = Site(setup)._arrays
-            assert taken(arrays) <= MIB * len(setup.links)
-            assert taken(arrays) == links_bytes(setup, arrays.calendars.shape[1])
+            assert count_link_bytes(arrays) <= MIB * len(setup.links)
+            assert count_link_bytes(arrays) == links_bytes(setup, arrays.calendars.shape[1])
 
 
 # Calendars that widen give what the widest give.
@@ -161,7 +161,7 @@ def many(count: int, rate_hz: int, delay_ms: float) -> str:
 def test_the_recorder_takes_virtual_runs(count: int, rate_hz: int) -> None:
     scenario = parse_scenario(many(count, rate_hz, 100.0))
     assert parse_embedded(scenario.text).names == scenario.names
-    assert taken(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
+    assert count_link_bytes(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
 
 
 def test_limit_has_equal_words_in_all_scenarios() -> None:

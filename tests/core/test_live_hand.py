@@ -52,7 +52,7 @@ def hands(steps: list[HandStep]) -> list[HandInForce]:
     return [HandInForce.read(step.vector) for step in steps]
 
 
-def at(
+def message_at(
     k: int, target: tuple[float, ...], n: int | None = None, **fields: Any
 ) -> dict[int, Any]:
     """Returns a message of hand 7 that comes at tick k."""
@@ -67,7 +67,7 @@ def at(
 
 
 def test_holds_begin_without_force_and_grow() -> None:
-    steps = run(at(10, (1.2, 0.5)), 150)
+    steps = run(message_at(10, (1.2, 0.5)), 150)
     before, first, *rest = hands(steps)[9:]
     assert before == HandInForce.read(empty_hand_vector(2))
     assert first.target == ARM
@@ -85,7 +85,7 @@ def test_the_target_glides_linearly_between_messages() -> None:
     messages: dict[int, Any] = {}
     for n in range(60):
         k = round(n * 1000 / 60)
-        messages |= at(k, (1.0 + 0.6 * k / 1000, 0.5))
+        messages |= message_at(k, (1.0 + 0.6 * k / 1000, 0.5))
     moved = np.array([hand.target[0] for hand in hands(run(messages, 1000))])
     speed = np.diff(moved)[200:] * 1000
     assert speed == pytest.approx(0.6, abs=0.05)
@@ -93,14 +93,14 @@ def test_the_target_glides_linearly_between_messages() -> None:
 
 
 def test_the_speed_of_the_target_is_limited() -> None:
-    steps = hands(run(at(0, (50.0, 0.5)), 180))
+    steps = hands(run(message_at(0, (50.0, 0.5)), 180))
     rates = [math.hypot(*hand.rate) for hand in steps]
     assert max(rates) == pytest.approx(1.5)
     assert steps[-1].target[0] == pytest.approx(1.0 + 1.5 * 0.179)
 
 
 def test_a_silent_hand_lets_go_and_fades() -> None:
-    steps = run(at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0), 500)
+    steps = run(message_at(0, (1.1, 0.5)) | message_at(150, (1.1, 0.5), n=0), 500)
     held = hands(steps)
     changes = {k: step.changes for k, step in enumerate(steps) if step.changes}
     last_ns = SILENCE_NS + 150_000_000
@@ -113,12 +113,12 @@ def test_a_silent_hand_lets_go_and_fades() -> None:
 
 
 def test_the_next_holder_follows_a_release() -> None:
-    release = at(50, (), n=50, grip=False)
+    release = message_at(50, (), n=50, grip=False)
     second = {
         40: [HandCommand(9, 0, True, (2.0, 2.0), 0)],
         160: [HandCommand(9, 1, True, (1.0, 0.6), 0)],
     }
-    steps = run(at(0, (1.1, 0.5)) | release | second, 200)
+    steps = run(message_at(0, (1.1, 0.5)) | release | second, 200)
     assert steps[40].refused == (ANOTHER_HOLDS,)
     assert steps[50].changes == ((7, RELEASED),)
     assert steps[160].changes == ((9, TAKEN),)
@@ -134,7 +134,10 @@ def test_a_new_holder_continues_a_fading_grip(source: int, starts_at_arm: bool) 
     rules = RULES._replace(starts_at_arm=starts_at_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
     steps = run(
-        at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0) | at(199, (), grip=False) | again,
+        message_at(0, (1.1, 0.5))
+        | message_at(150, (1.1, 0.5), n=0)
+        | message_at(199, (), grip=False)
+        | again,
         400,
         rules,
     )
@@ -154,19 +157,19 @@ def test_an_overtaken_message_changes_nothing() -> None:
         30: [HandCommand(7, 5, True, (9.0, 9.0), 0)],
         70: [HandCommand(7, 49, True, (9.0, 9.0), 0)],
     }
-    steps = run(at(10, (1.1, 0.5)) | at(50, (), n=50, grip=False) | late, 200)
+    steps = run(message_at(10, (1.1, 0.5)) | message_at(50, (), n=50, grip=False) | late, 200)
     assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
     assert steps[-1].vector == empty_hand_vector(2)
 
 
 def test_a_silent_hand_resumes_its_goal() -> None:
-    steps = run(at(0, (1.1, 0.5)) | at(400, (1.1, 0.5), n=0), 402)
+    steps = run(message_at(0, (1.1, 0.5)) | message_at(400, (1.1, 0.5), n=0), 402)
     assert [change for step in steps for _, change in step.changes] == [TAKEN, SILENT, TAKEN]
 
 
 def test_a_force_begins_at_zero() -> None:
     rules = HandRules(size=2, rate_hz=1000, starts_at_arm=False)
-    steps = hands(run(at(0, (8.0, 0.0)), 120, rules))
+    steps = hands(run(message_at(0, (8.0, 0.0)), 120, rules))
     assert steps[0].target == (0.0, 0.0)
     assert steps[-1].target == pytest.approx((8.0, 0.0))
 
@@ -243,7 +246,7 @@ def test_targets_reach_still_goals_without_overshoot(
     way = [x - start for x, start in zip(goal, ARM, strict=True)]
     distance = math.hypot(*way)
     # a hand repeats its last message while nothing changes
-    messages = {k: at(k, goal, n=0)[k] for k in range(0, 3000, 50)}
+    messages = {k: message_at(k, goal, n=0)[k] for k in range(0, 3000, 50)}
     steps = hands(run(messages, 3000, rules))
     for now in steps:
         moved = [x - start for x, start in zip(now.target, ARM, strict=True)]
@@ -255,8 +258,12 @@ def test_targets_reach_still_goals_without_overshoot(
 
 
 def test_targets_overshoot_returning_goals_by_stopping_distance() -> None:
-    messages = at(0, (4.0, 0.5)) | at(199, (4.0, 0.5), n=0) | at(200, (1.1, 0.5))
-    messages |= {k: at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
+    messages = (
+        message_at(0, (4.0, 0.5))
+        | message_at(199, (4.0, 0.5), n=0)
+        | message_at(200, (1.1, 0.5))
+    )
+    messages |= {k: message_at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
     steps = hands(run(messages, 2000, LIMITED))
     way = max(now.target[0] for now in steps) - steps[200].target[0]
     assert 0.0 < way <= 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
@@ -273,7 +280,7 @@ def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
         place = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
         # every other 100 ms the machine hands over late
         arrives = k + gap if (k // 100) % 2 else k
-        messages.setdefault(arrives - arrives % gap, []).extend(at(k, place)[k])
+        messages.setdefault(arrives - arrives % gap, []).extend(message_at(k, place)[k])
     for limits, least, most in ((LIMITED, 0.0, 0.85), (RULES, 0.0 if gap == 10 else 2.0, 40.0)):
         steps = hands(run(messages, 3000, limits))
         force = [
@@ -287,7 +294,7 @@ def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
 # The reach of an arm
 
 
-def test_goals_beyond_reach_move_inside() -> None:
+def test_goals_beyond_reach_move_to_nearest_place() -> None:
     ring = HandReach((0.0, 0.0), 0.5, 2.0)
     assert ring.find_nearest((3.0, 4.0)) == pytest.approx((1.2, 1.6))
     assert ring.find_nearest((0.0, 0.1)) == pytest.approx((0.0, 0.5))

@@ -116,7 +116,7 @@ def test_indispensable_peers_are_never_dropped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "overrides", "words"),
+    ("name", "overrides", "phrase"),
     [
         ("two_sites", RULE, "no site can go on without a master"),
         ("paper", {"on_stale.on_lost": "degrade"}, "needs on_stale.action = 'glide'"),
@@ -124,7 +124,7 @@ def test_indispensable_peers_are_never_dropped() -> None:
     ],
 )
 def test_an_impossible_rule_is_refused(
-    name: str, overrides: dict[str, Any], words: str
+    name: str, overrides: dict[str, Any], phrase: str
 ) -> None:
-    with pytest.raises(ScenarioError, match=words):
+    with pytest.raises(ScenarioError, match=phrase):
         load_scenario(name, overrides)

@@ -208,7 +208,7 @@ def test_chains_equal_pinocchios(file: str, base: str, tip: str, n: int) -> None
     check_dynamics(text, chain)
 
 
-def mend(text: str, link: str, given: LinkInertia) -> str:
+def mend(text: str, link: str, link_inertia: LinkInertia) -> str:
     """Returns a file with a mass and an inertia of a link written into its XML."""
     root = ElementTree.fromstring(text)
     element = next(match for match in root.findall("link") if match.get("name") == link)
@@ -219,14 +219,14 @@ def mend(text: str, link: str, given: LinkInertia) -> str:
     for tag in ("origin", "mass", "inertia"):
         part = inertial.find(tag)
         parts[tag] = ElementTree.SubElement(inertial, tag) if part is None else part
-    if given.mass_kg is not None:
-        parts["mass"].set("value", repr(given.mass_kg))
-    if given.com_m is not None:
-        parts["origin"].set("xyz", " ".join(map(repr, given.com_m)))
-    if given.inertia_kg_m2 is not None:
+    if link_inertia.mass_kg is not None:
+        parts["mass"].set("value", repr(link_inertia.mass_kg))
+    if link_inertia.com_m is not None:
+        parts["origin"].set("xyz", " ".join(map(repr, link_inertia.com_m)))
+    if link_inertia.inertia_kg_m2 is not None:
         parts["origin"].set("rpy", "0 0 0")
         keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-        for key, value in zip(keys, given.inertia_kg_m2, strict=True):
+        for key, value in zip(keys, link_inertia.inertia_kg_m2, strict=True):
             parts["inertia"].set(key, repr(value))
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -390,21 +390,21 @@ def test_two_velocity_torque_uses_christoffel_symbols() -> None:
     """Linear in v, equal to Pinocchio's where v is qd, and dM/dt = C + C'."""
     for chain, (state, *_) in chain_references().values():
         model, n = build_model(chain), len(chain.joints)
-        asked = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
+        resting = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
 
         def C(
             v: Array,
             model: pin.Model = model,
             chain: UrdfChain = chain,
-            asked: dict[str, Array] = asked,
+            still: dict[str, Array] = resting,
         ) -> Array:
-            return answer(model, chain, asked | {"v": v})["inverse_dynamics"]
+            return answer(model, chain, still | {"v": v})["inverse_dynamics"]
 
         matrix = np.stack([C(axis) for axis in np.eye(n)], axis=1)
         assert near(matrix @ state.v, C(state.v), 1e-12)
         h = 1e-6
         ends = [
-            answer(model, chain, asked | {"q": state.q + s * h * state.qd})["inertia"]
+            answer(model, chain, resting | {"q": state.q + s * h * state.qd})["inertia"]
             for s in (1, -1)
         ]
         assert near(matrix + matrix.T, (ends[0] - ends[1]) / (2 * h), 1e-7)

@@ -120,7 +120,7 @@ def test_rate_limits_keep_reference_jumps_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "words"),
+    ("limits", "phrase"),
     [
         ({"q_min_rad": 1.0, "q_max_rad": 0.5}, "above q_min_rad"),
         ({"q_max_rad": 0.2}, "start at most"),
@@ -128,8 +128,8 @@ def test_rate_limits_keep_reference_jumps_out() -> None:
         ({"tau_rate_limit_nm_s": 0.0}, "tau_rate_limit_nm_s"),
     ],
 )
-def test_impossible_limits_are_refused(limits: dict[str, object], words: str) -> None:
-    with pytest.raises(ScenarioError, match=words):
+def test_impossible_limits_are_refused(limits: dict[str, object], phrase: str) -> None:
+    with pytest.raises(ScenarioError, match=phrase):
         guarded(limits)
 
 

@@ -110,14 +110,14 @@ def test_every_driver_gives_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "silence", "words"),
+    ("rate_hz", "silence", "phrase"),
     [(100, 5.0, "two periods of 100 Hz"), (1000, 1.0, "two periods")],
 )
 def test_a_silence_shorter_than_two_periods_is_refused(
-    rate_hz: int, silence: float, words: str
+    rate_hz: int, silence: float, phrase: str
 ) -> None:
     text = TEXT.replace('action = "glide"', f'action = "glide"\nsilence_ms = {silence}')
-    with pytest.raises(ScenarioError, match=words):
+    with pytest.raises(ScenarioError, match=phrase):
         parse_scenario(
             text.format(duration_s=1.0, rate_hz=rate_hz, outages_s="[]", speed=0.5, limit=1.0)
         )

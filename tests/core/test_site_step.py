@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from tests.core.sites import VECTORS, bits, sample, setup, stepped
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
@@ -71,9 +71,9 @@ for scheme in ("second_order", "digital"):
 
 @pytest.mark.push
 def test_uncompiled_runs_have_the_same_bits() -> None:
-    plain = printed(_PROGRAM, compiled=False)
+    plain = run_program(_PROGRAM, compiled=False)
     assert plain.count("\n") == 2 * 3 * 250
-    assert plain == printed(_PROGRAM, compiled=True)
+    assert plain == run_program(_PROGRAM, compiled=True)
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])

@@ -30,14 +30,14 @@ def site(
     return Site(setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s))
 
 
-def at(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
+def peer_state(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
     """Returns position and velocity of a peer on its own straight way."""
     speed = (0.6, -0.2) if peer else (-0.3, 0.5)
     return (0.4 * peer + speed[0] * tick / 1000, -0.3 + speed[1] * tick / 1000), speed
 
 
 def moving(peer: int, tick: int) -> Arrival:
-    return Arrival(peer, tick, *at(peer, tick))
+    return Arrival(peer, tick, *peer_state(peer, tick))
 
 
 def cut_ticks(count: int = 200) -> list[TickInput]:
@@ -67,7 +67,8 @@ def followed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the reference of the peers, from the samples in use."""
     poses = [
-        ((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else at(j, m) for j, m in enumerate(output.used)
+        ((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else peer_state(j, m)
+        for j, m in enumerate(output.used)
     ]
     q, qd = (np.array([pose[n] for pose in poses]) for n in (0, 1))
     return np.array(shares) @ q, np.array(shares) @ qd

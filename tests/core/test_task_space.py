@@ -28,7 +28,7 @@ seeds = st.integers(0, 2**32 - 1)
 tasks = pytest.mark.parametrize("task", [PLACE, POSE], ids=["place", "pose"])
 
 
-def place(arrays: SiteArrays, q: Array, qd: Array) -> Row:
+def place_row(arrays: SiteArrays, q: Array, qd: Array) -> Row:
     """Returns the site's row with its end effector placed in a state."""
     s: Row = arrays.site[0]
     s.q, s.qd = q, qd
@@ -82,11 +82,13 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
     arrays, q, qd = draw(seed)
     h, m = 1e-6, arrays.site[0].shared
-    before, after = (np.array(place(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0))
-    here = place(arrays, q, qd)
+    before, after = (
+        np.array(place_row(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0)
+    )
+    here = place_row(arrays, q, qd)
     assert np.abs((after - before) / (2 * h) - here.Jd).max() <= 1e-7
-    low, high = (np.array(place(arrays, q + sign * h * qd, qd).x) for sign in (-1.0, 1.0))
-    xd = np.array(place(arrays, q, qd).xd)
+    low, high = (np.array(place_row(arrays, q + sign * h * qd, qd).x) for sign in (-1.0, 1.0))
+    xd = np.array(place_row(arrays, q, qd).xd)
     assert np.abs((high - low)[:3] / (2 * h) - xd[:3]).max() <= 1e-7
     if m == 6:
         turn = Rotation.from_rotvec(high[3:]) * Rotation.from_rotvec(low[3:]).inv()
@@ -97,7 +99,7 @@ def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
 def test_r_follows_the_task_in_any_posture(seed: int) -> None:
     """J r = x' + Lambda e wherever no axis is damped."""
     arrays, q, qd = draw(seed)
-    s = place(arrays, q, qd)
+    s = place_row(arrays, q, qd)
     s.q_des = np.array(s.x) + 0.01
     s.qd_des = 0.02
     update_task_errors(s)
@@ -112,11 +114,11 @@ def test_reference_acceleration_differentiates_reference_velocity(
     arrays = build(task)
     q, h = np.array(arrays.site[0].q), 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
-    x = np.array(place(arrays, q, qd).x)
+    x = np.array(place_row(arrays, q, qd).x)
     x[:3] += 0.05
     found = []
     for sign in (-1.0, 0.0, 1.0):
-        s = place(arrays, q + sign * h * qd, qd)
+        s = place_row(arrays, q + sign * h * qd, qd)
         s.q_des, s.qd_des = x, 0.0
         update_task_errors(s)
         found.append((np.array(s.v), np.array(s.a)))
@@ -132,7 +134,7 @@ def test_damping_begins_below_its_singular_value() -> None:
     straight = build(PLACE._replace(singular_value=0.5))
     q, qd = np.array(arrays.site[0].q), np.zeros(7)
     for one, damped in ((arrays, False), (straight, True)):
-        s = place(one, q, qd)
+        s = place_row(one, q, qd)
         s.q_des = np.array(s.x) - 0.1
         update_task_errors(s)
         left = np.abs(s.J @ s.v + s.Lambda * s.e).max()
@@ -142,7 +144,7 @@ def test_damping_begins_below_its_singular_value() -> None:
 @given(seed=seeds)
 def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
     arrays, q, qd = draw(seed)
-    s = place(arrays, q, qd)
+    s = place_row(arrays, q, qd)
     s.q_des = s.x
     update_task_errors(s)
     force = np.arange(1.0, 1.0 + s.shared)
@@ -153,7 +155,7 @@ def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
 
 def test_free_axes_get_no_torque() -> None:
     arrays = build(PLACE._replace(axes=(1.0, 0.0, 1.0)))
-    s = place(arrays, np.array(arrays.site[0].q), np.zeros(7))
+    s = place_row(arrays, np.array(arrays.site[0].q), np.zeros(7))
     s.q_des = np.array(s.x) + np.array([0.0, 0.3, 0.0])
     update_task_errors(s)
     assert np.abs(s.v).max() == 0.0

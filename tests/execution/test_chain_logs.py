@@ -21,7 +21,7 @@ N, TICKS = 6, 80
 
 
 @cache
-def made() -> bytes:
+def record_chain_log() -> bytes:
     """Returns a run in which every link delays by 20 ms."""
     stream = io.BytesIO()
     write_virtual_log(parse_scenario(six_joints(TICKS / 1000)), stream)
@@ -36,11 +36,11 @@ def changed(field: str, numbers: int) -> Log:
             record[field] = (record[field] * 2)[:numbers]
         return record
 
-    return opened(edited(made(), record=change))
+    return opened(edited(record_chain_log(), record=change))
 
 
 def test_six_joints_executed_again_equal_virtual_time() -> None:
-    log = opened(made())
+    log = opened(record_chain_log())
     verdict, twins = verify(log), compare_with_virtual(log)
     assert verdict.passed, str(verdict.first)
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -54,7 +54,8 @@ def test_six_joints_executed_again_equal_virtual_time() -> None:
 def test_two_records_resume_six_joints() -> None:
     log = opened(
         edited(
-            made(), record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r
+            record_chain_log(),
+            record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r,
         )
     )
     verdict = verify(log)
@@ -81,7 +82,7 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
             record["qd"][N - 1] = math.nextafter(record["qd"][N - 1], math.inf)
         return record
 
-    first = verify(opened(edited(made(), record=change))).first
+    first = verify(opened(edited(record_chain_log(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
 

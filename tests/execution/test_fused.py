@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from tests.execution.varying_links import VARYING_LINKS
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
@@ -219,9 +219,9 @@ for scheme in ("second_order", "digital"):
 
 @pytest.mark.long
 def test_without_the_compiler_it_has_the_same_bits() -> None:
-    plain = printed(_PROGRAM, compiled=False)
+    plain = run_program(_PROGRAM, compiled=False)
     assert plain.count("\n") == 8
-    assert plain == printed(_PROGRAM, compiled=True)
+    assert plain == run_program(_PROGRAM, compiled=True)
 
 
 def test_what_the_compiled_loop_cannot_run_is_refused() -> None:

@@ -18,7 +18,7 @@ from .deliveries import SITES
 Overrides = Mapping[str, Any] | Sequence[str]
 
 
-def asked(
+def request_rerun(
     replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False
 ) -> RerunRequest:
     return resolve_rerun_request(
@@ -44,7 +44,7 @@ def test_an_unchanged_request_is_the_logs_experiment() -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
+    ("overrides", "arguments"),
     [
         (["control.Kd=5"], ["control.Kd of s: 3 -> 5"]),
         (["sites.s.control.Kd=[5,6]"], ["control.Kd of s: 3 -> [5, 6]"]),
@@ -68,13 +68,13 @@ def test_an_unchanged_request_is_the_logs_experiment() -> None:
     ids=str,
 )
 def test_differences_are_lines_of_the_executed_scenario(
-    overrides: list[str], words: list[str]
+    overrides: list[str], arguments: list[str]
 ) -> None:
-    assert describe_rerun_changes(asked(["s"], overrides)) == words
+    assert describe_rerun_changes(request_rerun(["s"], overrides)) == arguments
 
 
 def test_copied_sites_keep_their_settings() -> None:
-    found = asked(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
+    found = request_rerun(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
     original = opened(recorded("paper")).scenario
     for name in ("m1", "m2"):
         assert found.scenario.sites[name] == original.sites[name]
@@ -92,18 +92,22 @@ def test_each_site_has_its_own_timeline() -> None:
         {"at_s": 0.02, "link": "s->m1", "to": {"delay_ms": 6.0}},
         {"at_s": 0.03, "dominance": "s", "to": {"m1": 1.0}},
     ]
-    found = asked(["s"], {"timeline": timeline})
+    found = request_rerun(["s"], {"timeline": timeline})
     assert [(change.link, change.dominance) for change in found.scenario.timeline] == [
         ("m1->s", ""),
         ("", "s"),
     ]
-    assert len(asked([], {"timeline": timeline}, closed_loop=True).scenario.timeline) == 3
+    assert (
+        len(request_rerun([], {"timeline": timeline}, closed_loop=True).scenario.timeline) == 3
+    )
 
 
 def test_all_sites_make_a_closed_loop() -> None:
-    assert asked(SITES).mode == asked([], closed_loop=True).mode == "closed loop"
-    assert asked(["s", "m1", "s"]).replaced == ("m1", "s")
-    assert asked(["s", "m1"]).mode == "open loop"
+    assert (
+        request_rerun(SITES).mode == request_rerun([], closed_loop=True).mode == "closed loop"
+    )
+    assert request_rerun(["s", "m1", "s"]).replaced == ("m1", "s")
+    assert request_rerun(["s", "m1"]).mode == "open loop"
 
 
 @pytest.mark.parametrize(
@@ -117,7 +121,7 @@ def test_sites_must_be_named_once(
     replace: list[str], closed_loop: bool, facts: list[str]
 ) -> None:
     with pytest.raises(UsageError) as caught:
-        asked(replace, closed_loop=closed_loop)
+        request_rerun(replace, closed_loop=closed_loop)
     assert all(fact in str(caught.value) for fact in facts)
 
 
@@ -140,16 +144,18 @@ def test_sites_must_be_named_once(
 )
 def test_fixed_settings_are_refused_with_reason(overrides: list[str], facts: list[str]) -> None:
     with pytest.raises(ScenarioError) as caught:
-        asked(["s"], overrides)
+        request_rerun(["s"], overrides)
     assert all(fact in str(caught.value) for fact in facts), caught.value
 
 
 def test_an_unknown_site_is_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="no site 'm3'; did you mean 'm"):
-        asked(["m3"])
+        request_rerun(["m3"])
 
 
 @pytest.mark.parametrize("other", [{"x": {"role": "slave"}}, {"s": {"rate_hz": 5}}])
 def test_whole_tables_cannot_change_sites_or_rates(other: dict[str, Any]) -> None:
     with pytest.raises(ScenarioError):
-        asked(["s"], {"sites": {"m1": {"role": "slave"}, "m2": {"role": "slave"}, **other}})
+        request_rerun(
+            ["s"], {"sites": {"m1": {"role": "slave"}, "m2": {"role": "slave"}, **other}}
+        )

@@ -23,7 +23,7 @@ LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
-def own(law: str = LAW, **more: Any) -> bytes:
+def record_own_law(law: str = LAW, **more: Any) -> bytes:
     return recorded("paper", {**SHORT, "control.law": law, **more})
 
 
@@ -46,7 +46,7 @@ def test_own_paper_law_gives_equal_bits(name: str) -> None:
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> None:
     """As much can be judged as of a shipped law."""
-    verdict = verify(without_records({"s": range(50, 61)}, own(), session))
+    verdict = verify(without_records({"s": range(50, 61)}, record_own_law(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
     ours = verify(without_records({"s": range(50, 61)}, recorded("paper", SHORT), session))
@@ -57,7 +57,7 @@ def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
     """If no memory has to be restored the law passes; behind a gap, or tick by tick, it does not."""
-    data = own("tests.laws:Forgetful")
+    data = record_own_law("tests.laws:Forgetful")
     assert verify(opened(data)).passed
     verdict = verify(without_records({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
@@ -86,7 +86,7 @@ def test_restarted_sites_are_the_same(law: str) -> None:
 
 
 def test_hidden_memory_shows_at_a_restart() -> None:
-    log = opened(own("tests.laws:Forgetful"))
+    log = opened(record_own_law("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
     verification = verify(log, resume_every=40)
@@ -95,7 +95,7 @@ def test_hidden_memory_shows_at_a_restart() -> None:
 
 
 def test_reports_explain_hidden_memory() -> None:
-    log = opened(own("tests.laws:Forgetful"))
+    log = opened(record_own_law("tests.laws:Forgetful"))
     (law,) = find_user_laws(log.scenario)[:1]
 
     def find_text(**settings: int) -> str:
@@ -116,7 +116,7 @@ def test_changed_memory_shows_at_its_tick() -> None:
             r["mem"][4] += 1e-3
         return r
 
-    verdict = verify(opened(edited(own(), record=record)))
+    verdict = verify(opened(edited(record_own_law(), record=record)))
     assert verdict.differing == 1
     assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
 

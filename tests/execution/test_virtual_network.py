@@ -75,9 +75,9 @@ def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
     return SiteLog("s", PEERS, 1000, payloads, "a test")
 
 
-def entries(came: Deliveries) -> set[Sample]:
+def entries(deliveries: Deliveries) -> set[Sample]:
     """Returns every sample that arrives, at any tick."""
-    return {(entry[0], entry[1]) for at in came.entries.values() for entry in at}
+    return {(entry[0], entry[1]) for at in deliveries.entries.values() for entry in at}
 
 
 def test_whole_logs_give_their_recorded_arrivals() -> None:

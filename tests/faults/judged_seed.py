@@ -1,4 +1,4 @@
-"""One seed judged: its session is run, and again, and every invariant is looked at."""
+"""The judgement of one seed: its session is run twice, and every invariant is checked."""
 
 import gc
 import hashlib
@@ -29,16 +29,16 @@ TORQUE, AGAIN = "I6 torque", "I11 again"
 
 
 class Judged(NamedTuple):
-    """What came of a session with faults.
+    """The result of a session with faults.
 
     Attributes:
-        faults: what went wrong.
-        arms: what its arms were given.
-        violations: by invariant, in words; empty if all held.
-        visited: how often what happened: modes that were entered, events, what was dropped, how sites ended.
-        holds: ticks from the last sample that came into use to each hold.
-        steps_nm: the largest step of a torque between ticks, by mode.
-        rises_j: how much the storage rises in a tick of a hold, as `find_rises` says.
+        faults: The faults of the session.
+        arms: The settings of its arms.
+        violations: Descriptions by invariant; empty if all invariants held.
+        visited: Counts of entered modes, events, dropped messages, and ends of sites.
+        holds: Ticks from the last sample that came into use to each hold.
+        steps_nm: The largest step of a torque between ticks, by mode.
+        rises_j: Rise of the storage in a tick of a hold, as returned by `find_rises`.
     """
 
     faults: Sequence[Fault]
@@ -111,7 +111,7 @@ def judge_faults(
 
 @contextmanager
 def collector_at_rest() -> Iterator[None]:
-    """As in a live site the collector of garbage does not run; then it looks at all at once."""
+    """Suspends the garbage collector, as in a live site, and collects once at the end."""
     gc.disable()
     try:
         yield

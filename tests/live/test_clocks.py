@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.cli.running import trilat
-from tests.truth import judged, members, offset_errors
+from tests.truth import judge_link, members, offset_errors
 
 from .processes import PAPER, Session, Stage, connections
 
@@ -36,7 +36,7 @@ def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
     log = session.is_reproduced()
     for site in PAPER:
         for peer in log.scenario.peers(site):
-            samples = judged(log, site, peer)
+            samples = judge_link(log, site, peer)
             assert len(samples.tick) > 6_000
             assert samples.inside >= 0.999
             assert samples.delay_us.min() > 0.0

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.truth import Member, again, judged, members, offset_errors
+from tests.truth import Member, again, judge_link, members, offset_errors
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
@@ -44,7 +44,7 @@ def clocks_as_injected(log: Log) -> None:
         assert clocks[name].offset_ns == offset_s * 1e9
         assert float(clocks[name].rate - 1) * 1e6 == pytest.approx(drift_ppm)
     for site, peer in pairs(PAPER):
-        link = judged(log, site, peer)
+        link = judge_link(log, site, peer)
         assert link.inside >= 0.999
         assert link.tick.size >= 0.5 * len(log[site])
         assert link.delay_us.min() > 0.0

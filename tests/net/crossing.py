@@ -43,7 +43,7 @@ def floor(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
 def second(
     other: Other,
     begin_ns: int,
-    there: Delay,
+    way: Delay,
     back: Delay,
     rnd: random.Random,
     messages: int = 50,
@@ -54,7 +54,7 @@ def second(
     ceilings, floors = [], []
     for n in range(messages):
         at_ns = begin_ns + n * (S // 2) // messages
-        ceilings.append(ceiling(other, at_ns, there(rnd)))
+        ceilings.append(ceiling(other, at_ns, way(rnd)))
         floors.append(floor(other, at_ns, back(rnd)))
     level = lambda limit: limit.offset_ns - other.drift_ppb * limit.local_ns / S  # noqa: E731
     return min(ceilings, key=level), max(floors, key=level)

@@ -23,7 +23,7 @@ HASH = "5c" * 32
 CLOCK = ManualClock().identity()
 
 
-def told(name: str, boot: int, **facts: object) -> Info:
+def answer_info(name: str, boot: int, **facts: object) -> Info:
     """Returns a member's answer about its identity; `facts` override."""
     recorder = name == topics.RECORDER
     own = {
@@ -94,7 +94,7 @@ class Party:
         clock = facts.pop("on_clock", self.clock)
         sites = () if name == topics.RECORDER else self.sites
         facts = {"boot": self._boot, "clock": clock.identity(), **facts}
-        return Member(self.network.join(), clock, sites, told(name, **facts))
+        return Member(self.network.join(), clock, sites, answer_info(name, **facts))
 
     def start(self, *names: str, **facts: object) -> None:
         for name in names:

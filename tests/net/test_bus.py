@@ -11,7 +11,7 @@ from trilat_net.net.bus import Bus, Inbox, StampedInbox, StampingRing
 
 from .local_bus import LocalNetwork
 from .networks import NETWORKS, Network
-from .waiting import answered, drained, received, until
+from .waiting import drained, query_once, received, until
 
 
 @pytest.fixture(
@@ -169,7 +169,7 @@ def test_questions_carry_their_payload(pair: tuple[Bus, Bus]) -> None:
 def test_responders_answer_at_once_without_polling(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
     other.respond("t/a/ping", lambda sent: sent[::-1])
-    assert until(lambda: answered(asker, "t/*/ping", b"123")) == ("t/a/ping", b"321")
+    assert until(lambda: query_once(asker, "t/*/ping", b"123")) == ("t/a/ping", b"321")
 
 
 def test_silent_responders_let_others_be_heard(network: Network) -> None:

@@ -136,9 +136,9 @@ def test_any_address_of_zenoh_may_be_a_router(endpoint: str) -> None:
 
 
 def router(
-    listen: list[str] | None, connect: list[str] | None, own: ZenohFile | None
+    listen: list[str] | None, connect: list[str] | None, zenoh_file: ZenohFile | None
 ) -> Connection:
-    return resolve_member_connection(listen, connect, None, own, HERE, routes=True)
+    return resolve_member_connection(listen, connect, None, zenoh_file, HERE, routes=True)
 
 
 def test_routers_listen_and_connect_as_configured() -> None:

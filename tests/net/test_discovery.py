@@ -23,7 +23,7 @@ from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
 
 from .local_bus import LocalNetwork
-from .parties import told
+from .parties import answer_info
 from .waiting import until
 
 SESSION = "o"
@@ -35,7 +35,7 @@ class Answering:
         (self.endpoint,) = find_free_endpoints(1)
         self._bus = ZenohBus([self.endpoint])
         scenario = load_scenario("paper")
-        info = told(
+        info = answer_info(
             "s", 1, scenario_sha256=scenario.sha256, scenario=scenario.text, running=running
         )
         self._publisher = EventPublisher(self._bus, SESSION, info)
@@ -118,7 +118,7 @@ def find(*payloads: bytes) -> list[Info]:
 
 
 def test_members_are_found_despite_unreadable_answers() -> None:
-    found = find(encode(told("m0", 1)), b"garbage")
+    found = find(encode(answer_info("m0", 1)), b"garbage")
     assert {info.member for info in found} == {"m0"}
     assert len(found) >= 2
     assert find() == []
@@ -128,7 +128,7 @@ def test_answers_of_other_versions_name_their_member() -> None:
     with pytest.raises(
         SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
     ):
-        find(encode(told("m0", 1, v=VERSION + 1)))
+        find(encode(answer_info("m0", 1, v=VERSION + 1)))
 
 
 def test_waiting_recorders_announce_themselves_first() -> None:
@@ -136,7 +136,7 @@ def test_waiting_recorders_announce_themselves_first() -> None:
     first = ZenohBus([default_endpoint(session, 0)])
     presence = first.presence(topics.presence_key(session, "*"))
     scenario = load_scenario("two_sites")
-    info = told("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)
+    info = answer_info("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)
     first.respond(topics.key(session, "m", topics.INFO), lambda _: encode(info))
     patience = {"stopped": lambda: False, "timeout_s": 10.0, "recorder_boot": 7}
     nowhere = Connection(connect=None)

@@ -99,12 +99,12 @@ def test_sites_with_own_settings_are_private() -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]]
+    "arguments", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]]
 )
 def test_other_commands_take_the_normal_way_quietly(
-    words: list[str], capsys: pytest.CaptureFixture[str]
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert stop_at_once(words) == words
+    assert stop_at_once(arguments) == arguments
     assert capsys.readouterr().out == ""
 
 

@@ -47,7 +47,7 @@ from trilat_net.net.zenoh_config import (
 )
 from trilat_net.scenario import load_scenario
 
-from .waiting import answered, drained, received, until
+from .waiting import drained, query_once, received, until
 
 SITES = ("m1", "m2", "s")
 ALL = (*SITES, RECORDER, OPERATOR, ROUTER, BRIDGE)
@@ -90,13 +90,15 @@ class Meeting:
     def _own(self, member: str) -> dict[str, Any]:
         return read_member_keys(self.folder / member).settings
 
-    def _enter(self, listen: list[str], connect: list[str], own: dict[str, Any]) -> ZenohBus:
-        bus = ZenohBus(listen, connect, self._mode, own)  # type: ignore[arg-type]
+    def _enter(
+        self, listen: list[str], connect: list[str], settings: dict[str, Any]
+    ) -> ZenohBus:
+        bus = ZenohBus(listen, connect, self._mode, settings)  # type: ignore[arg-type]
         self.members.append(bus)
         return bus
 
-    def join(self, own: dict[str, Any]) -> ZenohBus:
-        return self._enter([], self._places, own)
+    def join(self, settings: dict[str, Any]) -> ZenohBus:
+        return self._enter([], self._places, settings)
 
     def close(self) -> None:
         for member in reversed(self.members):
@@ -116,7 +118,7 @@ def key(member: str, channel: str) -> str:
     return topics.key("x", member, channel)
 
 
-def heard(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
+def exchange_messages(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
     came: list[tuple[str, bytes]] = []
 
     def there() -> bool:
@@ -145,7 +147,7 @@ def test_members_speak_under_their_own_name_only(meeting: Meeting, folder: Path)
         forged(b"forged")
         true(payload)
 
-    assert {where for where, _ in heard(say, inbox)} == {key("s", topics.EVENT)}
+    assert {where for where, _ in exchange_messages(say, inbox)} == {key("s", topics.EVENT)}
     assert until(alive.poll) == (topics.presence_key("x", "s").replace("*", "7"), True)
     assert drained(alive) == []
 
@@ -154,7 +156,7 @@ def test_no_member_answers_for_another(meeting: Meeting, folder: Path) -> None:
     attacker = meeting.join(lawless(read_member_keys(folder / "s")))
     attacker.respond(key("m2", topics.INFO), lambda _: b"forged")
     attacker.respond(key("s", topics.INFO), lambda _: b"true")
-    first = until(lambda: answered(meeting.m1, key("*", topics.INFO)))
+    first = until(lambda: query_once(meeting.m1, key("*", topics.INFO)))
     assert first == (key("s", topics.INFO), b"true")
     answers = [reply[1] for reply in received(meeting.m1.query(key("*", topics.INFO)), 1)]
     assert answers == [b"true"]
@@ -166,8 +168,8 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
     meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
     channels = (topics.HAND, topics.ENABLE)
     inboxes = [meeting.m1.inbox(key("m1", channel)) for channel in channels]
-    assert until(lambda: answered(operator, key("m1", topics.SET), b"order"))
-    assert answered(attacker, key("m1", topics.SET), b"order") is None
+    assert until(lambda: query_once(operator, key("m1", topics.SET), b"order"))
+    assert query_once(attacker, key("m1", topics.SET), b"order") is None
 
     for channel, inbox in zip(channels, inboxes, strict=True):
         forged, true = (bus.publisher(key("m1", channel)) for bus in (attacker, operator))
@@ -176,7 +178,7 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
             forged(b"forged")
             true(payload)
 
-        assert {payload for _, payload in heard(say, inbox)} == {b"true"}
+        assert {payload for _, payload in exchange_messages(say, inbox)} == {b"true"}
 
 
 def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path) -> None:
@@ -185,11 +187,12 @@ def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path)
         meeting.join(read_member_keys(folder / name).settings) for name in (BRIDGE, OPERATOR)
     )
     meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
-    assert until(lambda: answered(bridge, key("m1", topics.SET), b"reset"))
+    assert until(lambda: query_once(bridge, key("m1", topics.SET), b"reset"))
     for channel in (topics.HAND, topics.MEASURED):
         inbox = meeting.m1.inbox(key("m1", channel))
         assert {
-            payload for _, payload in heard(bridge.publisher(key("m1", channel)), inbox)
+            payload
+            for _, payload in exchange_messages(bridge.publisher(key("m1", channel)), inbox)
         } == {b"true"}
     switch = meeting.m1.inbox(key("m1", topics.ENABLE))
     forged, true = (bus.publisher(key("m1", topics.ENABLE)) for bus in (bridge, operator))
@@ -198,7 +201,7 @@ def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path)
         forged(b"forged")
         true(payload)
 
-    assert {payload for _, payload in heard(say, switch)} == {b"true"}
+    assert {payload for _, payload in exchange_messages(say, switch)} == {b"true"}
     states, samples = (
         bridge.inbox(key("*", channel)) for channel in (topics.STATE, topics.SAMPLE)
     )
@@ -209,7 +212,7 @@ def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path)
         state(payload)
 
     state = meeting.m1.publisher(key("m1", topics.STATE))
-    assert heard(tell, states)
+    assert exchange_messages(tell, states)
     assert drained(samples) == []
 
 
@@ -221,9 +224,9 @@ def test_every_member_may_stop_but_no_more(meeting: Meeting, folder: Path) -> No
         for name in ("s", RECORDER, OPERATOR)
     ]
     for member in members:
-        assert until(lambda bus=member: answered(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
-    assert until(lambda: answered(members[2], key("m1", topics.SET), b"reset"))
-    assert [answered(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [
+        assert until(lambda bus=member: query_once(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
+    assert until(lambda: query_once(members[2], key("m1", topics.SET), b"reset"))
+    assert [query_once(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [
         None,
         None,
     ]
@@ -254,7 +257,9 @@ def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> 
             withdrawn(b"withdrawn")
             true(payload)
 
-        assert {where for where, _ in heard(say, inbox)} == {key("m2", topics.EVENT)}
+        assert {where for where, _ in exchange_messages(say, inbox)} == {
+            key("m2", topics.EVENT)
+        }
     finally:
         for bus in (*others.values(), m1):
             bus.close()
@@ -272,7 +277,7 @@ def test_oversized_messages_are_dropped_alone(meeting: Meeting) -> None:
         publish(bytes(MOST_PUT_BYTES + 1))
         publish(payload)
 
-    assert {payload for _, payload in heard(say, records)} == {b"true"}
+    assert {payload for _, payload in exchange_messages(say, records)} == {b"true"}
     assert drained(inbox) == []  # a site hears no records but its own
 
 
@@ -288,7 +293,7 @@ def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
             meeting.join(lawless(read_member_keys(foreign / "m2")))
     else:
         stranger.publisher(key("m2", topics.EVENT))(b"forged")
-    came = heard(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
+    came = exchange_messages(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
     assert {payload for _, payload in came} == {b"true"}
 
 
@@ -324,7 +329,7 @@ def test_incomplete_keys_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("take", "from_", "words"),
+    ("take", "from_", "phrase"),
     [
         (CERTIFICATE, "s", "is for s, but"),
         (PRIVATE_KEY, "m2", "the private key and the certificate do not match"),
@@ -332,14 +337,14 @@ def test_incomplete_keys_are_refused(folder: Path, tmp_path: Path) -> None:
     ],
 )
 def test_keys_of_several_sets_do_not_mix(
-    take: str, from_: str, words: str, folder: Path, foreign: Path, tmp_path: Path
+    take: str, from_: str, phrase: str, folder: Path, foreign: Path, tmp_path: Path
 ) -> None:
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o600)
     source = folder / from_ if from_ else foreign / "m1"
     (tmp_path / take).write_bytes((source / take).read_bytes())
-    with pytest.raises(UsageError, match=words):
+    with pytest.raises(UsageError, match=phrase):
         read_member_keys(tmp_path)
 
 
@@ -494,9 +499,9 @@ def test_open_links_outlive_certificates(
             peer.inbox(key("m1", topics.EVENT)),
             site.publisher(key("m1", topics.EVENT)),
         )
-        assert heard(say, inbox)
+        assert exchange_messages(say, inbox)
         until(lambda: datetime.now(UTC) > ends + timedelta(seconds=1), 30.0)
-        assert heard(say, inbox)
+        assert exchange_messages(say, inbox)
 
 
 def test_ended_keys_may_only_stop_arms(
@@ -530,7 +535,7 @@ def test_renewed_keys_meet_older_ones(tmp_path: Path) -> None:
         name.value for name in names
     ]
     with two_members(folder) as (site, peer):
-        assert heard(
+        assert exchange_messages(
             site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
         )
     assert {path.name for path in renew_keys(folder)} == set(ALL)
@@ -566,8 +571,10 @@ def test_added_members_meet_the_others(tmp_path: Path) -> None:
     for member in ("m1", "m2", "s"):
         assert read_member_keys(folder / member).members == ("m1", "m2", "s")
     with two_members(folder) as (site, peer):  # m1, whose keys are the old ones, and s
-        assert heard(peer.publisher(key("s", topics.EVENT)), site.inbox(key("s", topics.EVENT)))
-        assert heard(
+        assert exchange_messages(
+            peer.publisher(key("s", topics.EVENT)), site.inbox(key("s", topics.EVENT))
+        )
+        assert exchange_messages(
             site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
         )
     assert {path.name for path in renew_keys(folder)} == {"m1", "m2", "s"}

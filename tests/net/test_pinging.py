@@ -27,7 +27,7 @@ from trilat_net.net.requests import Pong
 from trilat_net.net.wire import encode
 
 from .local_bus import LocalNetwork
-from .parties import SESSION, told
+from .parties import SESSION, answer_info
 
 S = 1_000_000_000
 STEP_NS = 1_000_000
@@ -75,7 +75,7 @@ class World:
     ) -> SkewedClock:
         clock = SkewedClock(self.clock, offset_ns, drift_ppb)
         answer_pings(
-            self.network.join(), clock, SESSION, told(name, boot, clock=clock.identity())
+            self.network.join(), clock, SESSION, answer_info(name, boot, clock=clock.identity())
         )
         return clock
 

@@ -17,7 +17,7 @@ from trilat_net.net.session import DECIDE_NS, EPOCH_AHEAD_NS
 from trilat_net.net.wire import encode
 
 from .local_bus import LocalNetwork
-from .parties import SESSION, STEP_NS, Member, Party, told
+from .parties import SESSION, STEP_NS, Member, Party, answer_info
 
 SITES = ("m1", "m2", "s")
 RECORDER = topics.RECORDER
@@ -415,7 +415,7 @@ def test_answers_under_foreign_keys_do_not_count() -> None:
     asked = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
     for _ in range(50):
         while (question := asked.poll()) is not None:
-            question.reply(encode(told("s", 1)))
+            question.reply(encode(answer_info("s", 1)))
         session.round()
     assert session.members["m1"].joining.membership.list_missing() == ["s"]
 
@@ -423,7 +423,7 @@ def test_answers_under_foreign_keys_do_not_count() -> None:
 def test_answers_of_other_versions_enter_the_error() -> None:
     session = party("m1", "m2")
     asked = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
-    newer: Info = told("s", 1, v=VERSION + 1)
+    newer: Info = answer_info("s", 1, v=VERSION + 1)
     for _ in range(50):
         while (question := asked.poll()) is not None:
             question.reply(encode(newer))

@@ -42,7 +42,7 @@ from trilat_net.net.wire import (
     split_states,
 )
 
-from .parties import told
+from .parties import answer_info
 
 STATE_VECTORS = Layout().lengths()
 
@@ -426,7 +426,7 @@ def test_statistics_and_infos_return(counts: dict[str, int], boot: int, tick: in
     }
     stats = LinkStats(**own, **dict.fromkeys((*each, "delay_us"), counts), **whole)
     assert decode(encode(stats), LinkStats) == stats
-    info = told("s", boot)
+    info = answer_info("s", boot)
     assert decode(encode(info), Info) == info
 
 

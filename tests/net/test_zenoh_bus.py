@@ -14,7 +14,7 @@ from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
 from .networks import Routed, encrypted, meet
-from .waiting import answered, received, until
+from .waiting import query_once, received, until
 
 
 def test_busy_ports_are_the_callers_named_error() -> None:
@@ -124,7 +124,7 @@ def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
             "trilat/lab/one/alive/1",
             True,
         )
-        assert until(lambda: answered(other, "trilat/lab/*/ping")) == (
+        assert until(lambda: query_once(other, "trilat/lab/*/ping")) == (
             "trilat/lab/one/ping",
             b"?",
         )
@@ -185,7 +185,7 @@ def test_members_meet_again_through_restarted_routers(routed: Routed) -> None:
         return inbox.poll() is not None
 
     until(heard)
-    assert until(lambda: answered(other, "t/*/ping")) == ("t/one/ping", b"?")
+    assert until(lambda: query_once(other, "t/*/ping")) == ("t/one/ping", b"?")
 
 
 @pytest.mark.long

@@ -27,7 +27,7 @@ def nested(path: str, value: object) -> Any:
     return value
 
 
-def found(settings: Mapping[str, Any], path: str) -> object:
+def look_up(settings: Mapping[str, Any], path: str) -> object:
     value: Any = settings
     for key in path.split("/"):
         value = value[key]
@@ -90,10 +90,10 @@ def test_accepted_files_keep_the_sessions_needs(data: st.DataObject) -> None:
     plain = make_zenoh_config([], [])
     for path, (holds, _) in REQUIREMENTS.items():
         try:
-            value = found(settings, path)
+            value = look_up(settings, path)
         except KeyError:
             continue  # neither stated nor set: Zenoh's default is what is needed
-        assert holds(value) or value == found(plain, path), path
+        assert holds(value) or value == look_up(plain, path), path
 
 
 def test_unneeded_settings_are_kept() -> None:
@@ -109,15 +109,15 @@ def test_unneeded_settings_are_kept() -> None:
         }
     ).settings
     settings = make_zenoh_config(["tcp/a:1"], ["tcp/b:1"], "peer", own)
-    assert found(settings, "transport/link/tx/lease") == 9_000
-    assert found(settings, "transport/link/protocols") == ["tls"]
-    assert found(settings, "transport/unicast/open_timeout") == 700
-    assert found(settings, "transport/unicast/accept_timeout") == 2_000
-    assert found(settings, "transport/auth/usrpwd/password") == "p"
+    assert look_up(settings, "transport/link/tx/lease") == 9_000
+    assert look_up(settings, "transport/link/protocols") == ["tls"]
+    assert look_up(settings, "transport/unicast/open_timeout") == 700
+    assert look_up(settings, "transport/unicast/accept_timeout") == 2_000
+    assert look_up(settings, "transport/auth/usrpwd/password") == "p"
     retry = {"period_init_ms": 100, "period_max_ms": 900, "period_increase_factor": 1.5}
-    assert found(settings, "connect/retry") == retry
-    assert found(settings, "connect/endpoints") == ["tcp/b:1"]
-    assert found(settings, "access_control/enabled") is False
+    assert look_up(settings, "connect/retry") == retry
+    assert look_up(settings, "connect/endpoints") == ["tcp/b:1"]
+    assert look_up(settings, "access_control/enabled") is False
 
 
 STOCK = Path(__file__).with_name("stock_session.json5")
@@ -144,10 +144,10 @@ def test_stock_files_without_gossip_are_accepted(tmp_path: Path) -> None:
     settings = make_zenoh_config(
         [], file.endpoints("connect", "peer") or [], "peer", file.settings
     )
-    assert found(settings, "transport/unicast/open_timeout") == 60_000
+    assert look_up(settings, "transport/unicast/open_timeout") == 60_000
     plain = make_zenoh_config([], [])
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
-        assert found(settings, key) == found(plain, key)
+        assert look_up(settings, key) == look_up(plain, key)
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
@@ -155,7 +155,7 @@ def test_values_equal_to_the_sessions_are_accepted(mode: str) -> None:
     """Once for the mode of the file, or by mode; those of another mode are refused."""
     plain = make_zenoh_config([], [], mode)  # type: ignore[arg-type]
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
-        used = found(plain, key)
+        used = look_up(plain, key)
         other = {-1: 0, 0: -1}[used] if key == "connect/timeout_ms" else not used
         assert checked({"mode": mode, **nested(key, used)}).mode == mode
         assert checked(nested(key, {mode: used})).mode == ""

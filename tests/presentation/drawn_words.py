@@ -11,7 +11,7 @@ SLACK_PT = 1.0
 """By so much boxes may touch: they have room above small letters."""
 
 
-def words(figure: Figure) -> list[tuple[str, Bbox]]:
+def list_drawn_texts(figure: Figure) -> list[tuple[str, Bbox]]:
     """Returns every text that is drawn and its box, pt; numbers of an axis that lie outside the
     axis are not drawn.
     """
@@ -39,7 +39,7 @@ def words(figure: Figure) -> list[tuple[str, Bbox]]:
 def misplaced(figure: Figure) -> list[str]:
     """Returns words that are not wholly in the figure, and pairs of words that overlap."""
     width, height = figure.get_size_inches() * 72.0
-    found = words(figure)
+    found = list_drawn_texts(figure)
     cut_off = [
         f"{said!r} is cut off"
         for said, box in found

@@ -165,8 +165,8 @@ def list_lerobot(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator
         yield column, frames[column].to_numpy()[:, 3:].astype(np.float64), motions["m"].turned
 
 
-def read_turn(found: Any) -> list[float]:
-    return [found.w, found.x, found.y, found.z]
+def read_turn(quantity: Any) -> list[float]:
+    return [quantity.w, quantity.x, quantity.y, quantity.z]
 
 
 def list_ros_series(

@@ -67,7 +67,7 @@ def info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
     return found
 
 
-def told(text: str, at_s: float, kind: str = "mark") -> Event:
+def make_event(text: str, at_s: float, kind: str = "mark") -> Event:
     return Event(member="a", boot=1, kind=kind, text=text, t_ns=round(at_s * 1e9))
 
 
@@ -160,8 +160,8 @@ def test_without_a_program_nobody_intervenes(tmp_path: Path) -> None:
 
 def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
     """Among others that held arms; a log without a policy has no intervention."""
-    taken = [told("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
-    taken += [told("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
+    taken = [make_event("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
+    taken += [make_event("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
     held = logs.rewritten(log(), others=taken)
     folder = exported(tmp_path, held, log())
     assert info(folder, "about")["program"] == "b and none"
@@ -173,7 +173,7 @@ def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
 def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
     """1 to 2 s succeed, 3 to 4 s fail, and the end interrupts the episode that begins at 5 s."""
     marks = [
-        told(f"episode {text}", at_s)
+        make_event(f"episode {text}", at_s)
         for text, at_s in (
             ("one begins", 1.0),
             ("one succeeded", 2.0),
@@ -182,7 +182,7 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
             ("three begins", 5.0),
         )
     ]
-    source = logs.rewritten(log(), others=[told("look", 0.5), *reversed(marks)])
+    source = logs.rewritten(log(), others=[make_event("look", 0.5), *reversed(marks)])
     folder = exported(tmp_path, source, episodes="marks", task="stack the cups")
     frames = read(folder)
     assert read(folder, "meta/episodes")["length"].to_list() == [30, 30, 30]
@@ -212,7 +212,7 @@ def test_unmarked_logs_are_one_reported_episode(tmp_path: Path) -> None:
 
 
 def test_an_episode_outside_the_records_is_refused(tmp_path: Path) -> None:
-    late = logs.rewritten(log(), others=[told("episode one begins", 7.0)])
+    late = logs.rewritten(log(), others=[make_event("episode one begins", 7.0)])
     with pytest.raises(LogError, match="no marked episode contains a time"):
         exported(tmp_path, late, episodes="marks")
 

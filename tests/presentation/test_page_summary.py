@@ -118,7 +118,7 @@ def test_checks_that_passed_are_one_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("finding", "words"),
+    ("finding", "phrase"),
     [
         (WRONG, "<details open><summary>✗ Failed: executed again</summary>"),
         (
@@ -127,8 +127,8 @@ def test_checks_that_passed_are_one_line() -> None:
         ),
     ],
 )
-def test_a_failed_check_is_named(finding: Finding, words: str) -> None:
-    assert words in render_checks([PASSED, finding], {"missing": 0})
+def test_a_failed_check_is_named(finding: Finding, phrase: str) -> None:
+    assert phrase in render_checks([PASSED, finding], {"missing": 0})
 
 
 def test_key_numbers_have_place_and_time() -> None:

@@ -49,7 +49,7 @@ def example(name):
 
 
 @cache
-def drawn(name, width_in):
+def draw_example(name, width_in):
     return figure(example(name), name, width_in)
 
 
@@ -66,7 +66,7 @@ def drawn(name, width_in):
     ],
 )
 def test_words_have_8_pt_without_overlap(name, width_in):
-    made = drawn(name, width_in)
+    made = draw_example(name, width_in)
     assert made.get_figwidth() == width_in
     assert misplaced(made) == []
     assert {text.get_fontsize() for text in made.findobj(Text) if text.get_text().strip()} == {
@@ -86,13 +86,13 @@ def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
     """252 pt are 3.5 in; Type 42 is TrueType, which journals accept, unlike Type 3."""
     before = dict(mpl.rcParams)
     path = tmp_path / f"{name}.pdf"
-    write_figure(drawn(name, COLUMN_IN), path, make_print_size(COLUMN_IN).dpi)
+    write_figure(draw_example(name, COLUMN_IN), path, make_print_size(COLUMN_IN).dpi)
     assert dict(mpl.rcParams) == before
     data = path.read_bytes()
     (box,) = re.findall(rb"/MediaBox \[ ?([\d. ]+) ?\]", data)
     left, bottom, right, top = map(float, box.split())
     assert (left, bottom, right) == (0.0, 0.0, pytest.approx(252.0))
-    assert top == pytest.approx(72.0 * drawn(name, COLUMN_IN).get_figheight())
+    assert top == pytest.approx(72.0 * draw_example(name, COLUMN_IN).get_figheight())
     assert len(re.findall(rb"/Type /Page\b(?!s)", data)) == 1
     assert b"/Type3" not in data
     assert data.count(b"/Subtype /Type0") == data.count(b"/FontFile2") > 0

@@ -49,7 +49,9 @@ class Rerun:
         return self.code
 
 
-def shown(paths: list[Path], show: ViewerOptions, code: int = 0) -> tuple[Rerun, list[str]]:
+def run_viewer(
+    paths: list[Path], show: ViewerOptions, code: int = 0
+) -> tuple[Rerun, list[str]]:
     said: list[str] = []
     rerun = Rerun(code)
     open_rerun(paths, lambda: open_log(*paths), show, said.append, rerun)
@@ -71,7 +73,7 @@ def test_finished_logs_with_views_are_opened_directly(files: dict[str, Path]) ->
 
 
 def test_temporary_files_end_with_the_viewer(files: dict[str, Path]) -> None:
-    rerun, said = shown([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
+    rerun, said = run_viewer([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
     assert "/lab/m/joint_states" in rerun.topics
     assert said == ["making standard channels of every record ..."]
     assert not rerun.log.exists()
@@ -84,7 +86,7 @@ def test_parts_and_torn_logs_are_shown_whole(files: dict[str, Path], tmp_path: P
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(files["live"].read_bytes()[:150_000])
     for paths, name in ((parts, parts[0].name), ([torn], "run.mcap")):
-        rerun, _ = shown(paths, ViewerOptions(save=Path("x.rrd")))
+        rerun, _ = run_viewer(paths, ViewerOptions(save=Path("x.rrd")))
         assert rerun.log.name == name
         assert {"/lab/m/joint_states", "/lab/s/error"} <= rerun.topics
 
@@ -101,13 +103,13 @@ def test_names_unsuitable_for_rerun_are_replaced(
     }
     assert {name: make_application_id(Path(name)) for name in names} == names
     (tmp_path / "ü.mcap").write_bytes(files["live"].read_bytes())
-    rerun, _ = shown([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
+    rerun, _ = run_viewer([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
     assert rerun.log.stem == "log"
     assert "/viz/m/error" in rerun.topics
 
 
 def test_browsers_get_an_address(files: dict[str, Path]) -> None:
-    rerun, (told,) = shown([files["live"]], ViewerOptions(web=True))
+    rerun, (told,) = run_viewer([files["live"]], ViewerOptions(web=True))
     page = rerun.command[rerun.command.index("--web-viewer-port") + 1]
     port = rerun.command[rerun.command.index("--port") + 1]
     assert "--serve-web" in rerun.command
@@ -123,9 +125,9 @@ def test_a_window_needs_a_display(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(rerun_viewer.sys, "platform", "linux")
     with pytest.raises(UsageError, match=r"no display here; .* web"):
-        shown([files["live"]], ViewerOptions())
+        run_viewer([files["live"]], ViewerOptions())
     monkeypatch.setenv("DISPLAY", ":0")
-    rerun, _ = shown([files["live"]], ViewerOptions())
+    rerun, _ = run_viewer([files["live"]], ViewerOptions())
     assert "--serve-web" not in rerun.command
     assert "--save" not in rerun.command
 
@@ -135,12 +137,12 @@ def test_failures_are_reported(
 ) -> None:
     web = ViewerOptions(web=True)
     with pytest.raises(RunFailed, match="Rerun ended with exit code 3"):
-        shown([files["live"]], web, code=3)
+        run_viewer([files["live"]], web, code=3)
     with pytest.raises(LogError, match="No such file"):
-        shown([tmp_path / "none.mcap"], web)
+        run_viewer([tmp_path / "none.mcap"], web)
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(UsageError, match=re.escape(format_extra_install("view"))):
-        shown([files["live"]], web)
+        run_viewer([files["live"]], web)
 
 
 def test_rerun_takes_log_and_layout_into_one_recording(

@@ -1,4 +1,6 @@
-"""A recording into memory, on a clock that the test moves, and sites that remember their messages."""
+"""A recording into memory, on a clock that the test moves, and sites that remember their
+messages.
+"""
 
 import io
 from collections.abc import Callable, Iterator, Sequence
@@ -35,9 +37,9 @@ SCENARIO = load_scenario("two_sites", {"duration_s": 0.05})
 TICKS = SCENARIO.ticks("m")
 
 
-def told(name: str, **facts: object) -> Info:
+def answer_info(name: str, **facts: object) -> Info:
     scenario = {"scenario_sha256": SCENARIO.sha256, "scenario": SCENARIO.text}
-    return parties.told(name, BOOTS[name], **{**scenario, **facts})
+    return parties.answer_info(name, BOOTS[name], **{**scenario, **facts})
 
 
 def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:
@@ -67,13 +69,13 @@ def end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> 
 
 
 class Memory:
-    """What a site answers when it is asked for its past; at most so many messages at once.
+    """The answers of a site to requests for its past, with a bounded number of messages each.
 
     Attributes:
-        made: all that it has made, by channel.
-        oldest: number of the oldest message that it still has, by channel.
-        asked: every question that reached it.
-        replies: what becomes of an answer on its way: the payloads that arrive.
+        made: All messages that the site made, by channel.
+        oldest: Number of the oldest remembered message, by channel.
+        asked: Every request that reached the site.
+        replies: Changes an answer on its way, and returns the payloads that arrive.
     """
 
     def __init__(self, network: LocalNetwork, name: str, chunk: int = 64) -> None:
@@ -123,7 +125,7 @@ class Desk:
         self.stream = io.BytesIO()
         self.tap = InboundQueue(self.clock)
         own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
-        info = told(topics.RECORDER, scenario="", scenario_sha256="")
+        info = answer_info(topics.RECORDER, scenario="", scenario_sha256="")
         publisher = EventPublisher(
             self.bus, SESSION, info, lambda payload: self.tap.receive(own, payload)
         )

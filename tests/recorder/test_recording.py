@@ -36,11 +36,11 @@ from .desk import (
     UNIX_NS,
     Desk,
     Memory,
+    answer_info,
     end,
     happening,
     states,
     statistics,
-    told,
 )
 
 
@@ -348,7 +348,7 @@ def start_recorder(
         stopped=lambda: clock.monotonic_ns() > stop_ns,
         say=str,
     )
-    recorder._joining.membership.others["m"] = told("m")
+    recorder._joining.membership.others["m"] = answer_info("m")
     return recorder
 
 
@@ -361,7 +361,9 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
     def run(clock: RelayClock) -> None:
         recorder = start_recorder(network, clock, folder, stop_ns)
         met = recorder._joining.membership.others
-        stranger = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")
+        stranger = msgspec.structs.replace(
+            answer_info("m"), member="x", boot=5, scenario="garbage"
+        )
         recorder._joining.membership.others = {"x": stranger, **met}
         recorder.record(EPOCH)
 

@@ -9,7 +9,7 @@ from trilat_net.scenario import load_scenario
 from .desk import MS, SESSION, Desk, S, states
 
 
-def heard(desk: Desk) -> list[RecorderStats]:
+def read_reports(desk: Desk) -> list[RecorderStats]:
     return [decode(message[1], RecorderStats) for message in iter(desk.reports.poll, None)]
 
 
@@ -22,7 +22,7 @@ def test_reports_give_stored_and_missing_records() -> None:
     desk.report.note_flush(2 * MS)
     desk.tap.receive("somewhere", b"")
     desk.report.publish()
-    (stats,) = heard(desk)
+    (stats,) = read_reports(desk)
     assert stats.queued == 1
     assert (stats.expected["m/state"], stats.received["m/state"]) == (30, 28)
     assert (stats.missing["m/state"], stats.gaps) == (2, {"m/state": ["10-11"]})
@@ -37,7 +37,7 @@ def test_reports_give_stored_and_missing_records() -> None:
         *("recorder/event", "recorder/stats"),
     }
     desk.report.publish()
-    assert heard(desk)[0].flush_max_us == 0
+    assert read_reports(desk)[0].flush_max_us == 0
 
 
 def test_reports_come_once_a_second_in_logs() -> None:
@@ -46,7 +46,7 @@ def test_reports_come_once_a_second_in_logs() -> None:
         desk.wait(10 * MS)
         desk.write()
         desk.report.poll()
-    said = heard(desk)
+    said = read_reports(desk)
     assert [stats.t_ns for stats in said] == [
         REPORT_EVERY_NS,
         2 * REPORT_EVERY_NS,
@@ -61,7 +61,7 @@ def test_sleeping_recorders_skip_reports() -> None:
     for _ in range(160):
         desk.report.poll()
         desk.wait(10 * MS)
-    assert [stats.t_ns // MS for stats in heard(desk)] == [10_300, 11_300]
+    assert [stats.t_ns // MS for stats in read_reports(desk)] == [10_300, 11_300]
 
 
 def test_reports_always_fit_a_message() -> None:
@@ -75,6 +75,6 @@ def test_reports_always_fit_a_message() -> None:
             key
         ]
     desk.report.publish()
-    (stats,) = heard(desk)
+    (stats,) = read_reports(desk)
     assert sum(map(len, stats.gaps.values())) <= 600
     assert len(encode(stats)) < MAX_BYTES

@@ -82,7 +82,7 @@ def test_shipped_arms_have_their_makers_data() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("changes", "path", "phrase"),
     [
         (
             {"arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.1]},
@@ -184,13 +184,13 @@ def test_shipped_arms_have_their_makers_data() -> None:
         ),
     ],
 )
-def test_mistakes_are_refused_at_their_key(changes: Overrides, path: str, words: str) -> None:
+def test_mistakes_are_refused_at_their_key(changes: Overrides, path: str, phrase: str) -> None:
     error = refusal(changes)
-    assert (error.path, words in error.problem) == (f"sites.m1.{path}", True), error
+    assert (error.path, phrase in error.problem) == (f"sites.m1.{path}", True), error
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("changes", "path", "phrase"),
     [
         ({"arm.urdf": "nope.urdf"}, "arm.urdf", "nope.urdf cannot be read: No such file"),
         ({"arm.urdf": 5}, "arm.urdf", "file's name"),
@@ -205,10 +205,10 @@ def test_mistakes_are_refused_at_their_key(changes: Overrides, path: str, words:
     ],
 )
 def test_mistakes_of_whole_scenarios_are_refused(
-    changes: Overrides, path: str, words: str
+    changes: Overrides, path: str, phrase: str
 ) -> None:
     error = refusal(changes)
-    assert (error.path, words in error.problem) == (path, True), error
+    assert (error.path, phrase in error.problem) == (path, True), error
 
 
 @pytest.mark.parametrize("key", ["armature_kg_m2", "payload_kg", "stops", "down", "tip"])

@@ -123,7 +123,7 @@ def test_randomness_and_network_dependence_are_known(
 
 
 @pytest.mark.parametrize(
-    ("keys", "path", "words"),
+    ("keys", "path", "phrase"),
     [
         ({"model": "unifrom"}, "link.model", "did you mean 'uniform'"),
         ({"model": 3}, "link.model", "must be one of"),
@@ -150,10 +150,10 @@ def test_randomness_and_network_dependence_are_known(
         ({"model": "hyperexponential", "floor_ms": 5}, "fast_ms", "is missing"),
     ],
 )
-def test_links_do_not_accept_other_keys(keys: dict[str, Any], path: str, words: str) -> None:
+def test_links_do_not_accept_other_keys(keys: dict[str, Any], path: str, phrase: str) -> None:
     error = refused(keys)
     assert path in error.path
-    assert words in error.problem
+    assert phrase in error.problem
 
 
 @pytest.mark.parametrize(

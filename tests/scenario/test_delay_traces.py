@@ -66,7 +66,7 @@ def test_traces_keep_microseconds(rows: list[tuple[int, int]]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "phrase"),
     [
         ("", "has no points"),
         ("t_s,delay_ms\n# nothing\n", "has no points"),
@@ -83,7 +83,7 @@ def test_traces_keep_microseconds(rows: list[tuple[int, int]]) -> None:
     ],
 )
 def test_invalid_traces_are_refused_with_place(
-    tmp_path: Path, content: str, words: str
+    tmp_path: Path, content: str, phrase: str
 ) -> None:
     (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
     with pytest.raises(ScenarioError) as error:
@@ -91,7 +91,7 @@ def test_invalid_traces_are_refused_with_place(
             "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}}
         )
     assert error.value.path == "links.m1->s.file"
-    assert words in error.value.problem
+    assert phrase in error.value.problem
     assert "delays.csv" in error.value.problem
 
 
@@ -181,7 +181,7 @@ def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("link", "path", "words"),
+    ("link", "path", "phrase"),
     [
         ('[link]\nmodel = "trace"', "links.m2->m1.file", "is missing"),
         (
@@ -198,9 +198,9 @@ def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
     ],
 )
 def test_a_traces_origin_is_named_once(
-    tmp_path: Path, link: str, path: str, words: str
+    tmp_path: Path, link: str, path: str, phrase: str
 ) -> None:
     with pytest.raises(ScenarioError) as error:
         scenario(tmp_path, link)
     assert error.value.path == path
-    assert words in error.value.problem
+    assert phrase in error.value.problem

@@ -14,7 +14,7 @@ from trilat_net.scenario.rest_bounds import find_rest_bounds
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
+def compare_texts(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
     return {
         str(one): one.values
         for one in compare_scenarios([load_scenario(name, sets) for name, sets in scenarios])
@@ -22,19 +22,19 @@ def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
 
 
 def test_renamed_experiments_do_not_differ() -> None:
-    assert told(("free", []), ("free", ["name=other", "expect.stable=false"])) == {}
+    assert compare_texts(("free", []), ("free", ["name=other", "expect.stable=false"])) == {}
 
 
 def test_a_gain_of_all_sites_is_one_line() -> None:
-    assert told(("free", []), ("free", ["control.Kd=5"])) == {
+    assert compare_texts(("free", []), ("free", ["control.Kd=5"])) == {
         "control.Kd of m1, m2, s": ("3", "5")
     }
-    found = told(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
+    found = compare_texts(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
     assert found == {"control.Kd of s": ("3", "[5, 6]")}
 
 
 def test_another_law_is_shown_whole() -> None:
-    found = told(("free", []), ("free", ["control.law=p_d"]))
+    found = compare_texts(("free", []), ("free", ["control.law=p_d"]))
     assert found == {
         "control of m1, m2, s": (
             "adaptive (Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0)",
@@ -44,7 +44,7 @@ def test_another_law_is_shown_whole() -> None:
 
 
 def test_links_are_described_in_words() -> None:
-    found = told(
+    found = compare_texts(
         ("free", []), ("free", ["link.delay_ms=50"]), ("free", ["links.m1->s.delay_ms=9"])
     )
     assert found == {
@@ -54,7 +54,7 @@ def test_links_are_described_in_words() -> None:
 
 
 def test_other_scenarios_other_sites_other_hands() -> None:
-    found = told(("contact", []), ("free", []))
+    found = compare_texts(("contact", []), ("free", []))
     assert found["sites"] == ("m, s", "m1, m2, s")
     assert "wall" in found["environment of s"][0]
     assert found["environment of s"][1] == "none"

@@ -29,14 +29,14 @@ EXAMPLE: dict[str, Any] = {
 }
 
 
-def drawn(seed: int) -> Scenario:
+def draw_scenario(seed: int) -> Scenario:
     return load_scenario("free", {**EXAMPLE, "seed": seed})
 
 
 def test_each_number_is_drawn_separately() -> None:
     """Joints, sites and seeds differ; the same seed gives the same."""
-    one, other = drawn(1), drawn(2)
-    assert one == drawn(1)
+    one, other = draw_scenario(1), draw_scenario(2)
+    assert one == draw_scenario(1)
     assert len(set(one.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
     assert len({spec.arm.m1_kg for spec in (*one.sites.values(), *other.sites.values())}) == 6
     assert one.random
@@ -45,9 +45,9 @@ def test_each_number_is_drawn_separately() -> None:
 
 
 def test_further_drawn_numbers_change_none() -> None:
-    more = load_scenario(drawn(1), {"sites.s.q0_rad": {"normal": [0.0, 1.0]}})
-    assert more.sites["m1"] == drawn(1).sites["m1"]
-    assert more.sites["s"].q0_rad != drawn(1).sites["s"].q0_rad
+    more = load_scenario(draw_scenario(1), {"sites.s.q0_rad": {"normal": [0.0, 1.0]}})
+    assert more.sites["m1"] == draw_scenario(1).sites["m1"]
+    assert more.sites["s"].q0_rad != draw_scenario(1).sites["s"].q0_rad
 
 
 def test_numbers_follow_their_distribution() -> None:
@@ -63,7 +63,7 @@ def test_numbers_follow_their_distribution() -> None:
 
 
 def test_canonical_text_holds_the_drawn_numbers() -> None:
-    one = drawn(3)
+    one = draw_scenario(3)
     again = parse_scenario(one.text)
     assert again == one
     assert again.sha256 == one.sha256
@@ -73,11 +73,11 @@ def test_canonical_text_holds_the_drawn_numbers() -> None:
 def test_another_seed_draws_again_from_any_source() -> None:
     """From a scenario, and from the text of a log: hands that hold the start pose too."""
     for found in (
-        reseed_scenario(drawn(1), 5),
-        reseed_scenario(parse_scenario(drawn(2).text), 5),
+        reseed_scenario(draw_scenario(1), 5),
+        reseed_scenario(parse_scenario(draw_scenario(2).text), 5),
     ):
-        assert found == drawn(5)
-        assert found.sha256 == drawn(5).sha256
+        assert found == draw_scenario(5)
+        assert found.sha256 == draw_scenario(5).sha256
     spring, tip, _ = found.sites["m1"].hands
     assert spring.from_rad == spring.to_rad == found.sites["m1"].q0_rad
     a, b = found.sites["m1"].q0_rad
@@ -127,15 +127,17 @@ def test_changing_seeds_back_restores_the_experiment(
 
 
 def test_replaced_numbers_stay() -> None:
-    fixed = load_scenario(drawn(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"})
+    fixed = load_scenario(
+        draw_scenario(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"}
+    )
     other = reseed_scenario(fixed, 2)
     assert other.sites["m1"].q0_rad == (0.3, 0.0)
-    assert other.sites["m1"].arm == drawn(2).sites["m1"].arm
+    assert other.sites["m1"].arm == draw_scenario(2).sites["m1"].arm
     assert not any(".control." in key for key in other.drawn)
 
 
 def test_an_experiment_without_operators_stays_itself() -> None:
-    alone = drawn(1).without_hands()
+    alone = draw_scenario(1).without_hands()
     assert parse_scenario(alone.text) == alone
 
 

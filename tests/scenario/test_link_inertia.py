@@ -251,7 +251,7 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("links", "path", "words"),
+    ("links", "path", "phrase"),
     [
         ({"fingr": {"mass_kg": 1.0}}, "links.fingr", "did you mean 'finger'"),
         ({"base": {"mass_kg": 1.0}}, "links.base", "moved by no joint"),
@@ -286,11 +286,11 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
         ({"finger": {"mass_kg": math.inf}}, "arm.links.finger.mass_kg", "finite"),
     ],
 )
-def test_wrong_inertias_are_refused_at_their_key(links: Any, path: str, words: str) -> None:
+def test_wrong_inertias_are_refused_at_their_key(links: Any, path: str, phrase: str) -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(FINGER, {"tip": "lower", "links": links})
     assert refused.value.path.endswith(path)
-    assert words in refused.value.problem
+    assert phrase in refused.value.problem
 
 
 def test_links_without_mass_in_files_need_one() -> None:

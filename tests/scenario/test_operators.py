@@ -152,7 +152,7 @@ def test_wrong_types_name_the_wanted_one(group: str, entry: Any, key: str) -> No
     ],
     ids=str,
 )
-def test_mistakes_are_refused(group: str, entry: Any, said: str) -> None:
+def test_mistakes_are_refused_at_their_key(group: str, entry: Any, said: str) -> None:
     assert re.match(said, refused(group, entry))
 
 

@@ -97,7 +97,7 @@ def test_traces_may_end_but_not_begin() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "path", "words"),
+    ("change", "path", "phrase"),
     [
         (
             {**LINK, "link": "m1->ss"},
@@ -150,10 +150,10 @@ def test_traces_may_end_but_not_begin() -> None:
         (5, "timeline[0]", "must be a table"),
     ],
 )
-def test_impossible_changes_are_refused_with_path(change: Any, path: str, words: str) -> None:
+def test_impossible_changes_are_refused_with_path(change: Any, path: str, phrase: str) -> None:
     error = refused(change)
     assert error.path == path
-    assert words in error.problem
+    assert phrase in error.problem
 
 
 def test_changes_stand_in_time_order() -> None:
@@ -230,7 +230,7 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("written", "words"),
+    ("written", "phrase"),
     [
         ({"link": "m1->x", "to": {}}, "no link 'm1->x'"),
         ({"link": "m1->s", "dominance": "s"}, "must name either a link"),
@@ -239,8 +239,8 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
         ({"dominance": "s", "to": {"m1": 1}, "ramp_s": -1.0}, "ramp_s"),
     ],
 )
-def test_impossible_orders_are_refused(written: dict[str, Any], words: str) -> None:
-    with pytest.raises(ScenarioError, match=words):
+def test_impossible_orders_are_refused(written: dict[str, Any], phrase: str) -> None:
+    with pytest.raises(ScenarioError, match=phrase):
         ordered(load_scenario("paper"), written)
 
 

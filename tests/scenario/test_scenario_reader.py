@@ -350,7 +350,7 @@ def test_infinite_numbers_are_refused(key: str, value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "words"),
+    ("row", "phrase"),
     [
         ({"m2": 0.5, "s": 0.4}, "sum to 0.9"),
         ({"m2": 0.5, "s": 0.5 + 1e-8}, "sum to 1"),
@@ -359,11 +359,11 @@ def test_infinite_numbers_are_refused(key: str, value: float) -> None:
         ({}, "sum to 0"),
     ],
 )
-def test_rows_of_alpha_are_checked(row: dict[str, float], words: str) -> None:
+def test_rows_of_alpha_are_checked(row: dict[str, float], phrase: str) -> None:
     """Eq. (7), to 1e-9."""
     error = refused({"dominance.m1": row})
     assert error.path == "dominance.m1"
-    assert words in error.problem
+    assert phrase in error.problem
 
 
 @pytest.mark.parametrize(

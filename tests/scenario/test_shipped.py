@@ -9,7 +9,7 @@ from tests.virtual_runs import Run, trajectories
 from trilat_net.scenario import load_scenario
 
 
-def ran(name: str, overrides: dict[str, Any] | None = None) -> Run:
+def run_shipped(name: str, overrides: dict[str, Any] | None = None) -> Run:
     return trajectories(load_scenario(name, {"expect": {}, **(overrides or {})}))
 
 
@@ -23,13 +23,13 @@ def ages(run: Run) -> np.ndarray:
 @pytest.mark.long
 def test_newer_samples_overtake_on_4g() -> None:
     short = {"duration_s": 6.0}
-    assert ages(ran("4g", short)).mean() == pytest.approx(21, abs=3)
-    assert ages(ran("4g", {**short, "link.order": "in_order"})).mean() > 400
+    assert ages(run_shipped("4g", short)).mean() == pytest.approx(21, abs=3)
+    assert ages(run_shipped("4g", {**short, "link.order": "in_order"})).mean() > 400
 
 
 @pytest.mark.long
 def test_handover_changes_sides_without_a_step() -> None:
-    made = ran("handover", {"duration_s": 13.1})
+    made = run_shipped("handover", {"duration_s": 13.1})
     m1, m2, s = (made.sites[name].q[:, 0] for name in ("m1", "m2", "s"))
     beyond = s - (m1 + m2) / 2
     assert beyond[9900] > 0.14

@@ -14,7 +14,7 @@ TEXT = planar_task()
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("changes", "path", "phrase"),
     [
         (
             {"sites.s.q0_rad": [0.1, 0.0]},
@@ -50,15 +50,15 @@ TEXT = planar_task()
     ],
 )
 def test_task_mistakes_are_refused_at_their_key(
-    changes: dict[str, Any], path: str, words: str
+    changes: dict[str, Any], path: str, phrase: str
 ) -> None:
     with pytest.raises(ScenarioError) as refused:
         parse_scenario(TEXT, overrides=changes)
-    assert (refused.value.path, words in refused.value.problem) == (path, True), refused.value
+    assert (refused.value.path, phrase in refused.value.problem) == (path, True), refused.value
 
 
 @pytest.mark.parametrize(
-    ("name", "key", "value", "words"),
+    ("name", "key", "value", "phrase"),
     [
         ("free", "arm.base_xyz_m", [1, 0, 0], "all arms are planar"),
         ("free", "arm.base_rpy_rad", [1, 0, 0], "all arms are planar"),
@@ -66,8 +66,8 @@ def test_task_mistakes_are_refused_at_their_key(
         ("free", "task.singular_value", 0.3, "sites share joint angles"),
     ],
 )
-def test_a_key_without_effect_is_refused(name: str, key: str, value: Any, words: str) -> None:
-    with pytest.raises(ScenarioError, match=words) as refused:
+def test_a_key_without_effect_is_refused(name: str, key: str, value: Any, phrase: str) -> None:
+    with pytest.raises(ScenarioError, match=phrase) as refused:
         load_scenario(name, {key: value})
     assert refused.value.path == f"sites.m1.{key}"
 

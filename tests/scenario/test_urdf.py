@@ -159,13 +159,16 @@ def stated(masses: Array, places: Array, angles: Array) -> str:
     inertia = " ".join(
         f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True)
     )
-    origin, mass = f'xyz="{words(c)}" rpy="{words(angles)}"', float(masses.sum())
+    origin, mass = (
+        f'xyz="{format_vector(c)}" rpy="{format_vector(angles)}"',
+        float(masses.sum()),
+    )
     return (
         f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
     )
 
 
-def words(vector: Array) -> str:
+def format_vector(vector: Array) -> str:
     return " ".join(repr(float(x)) for x in vector)
 
 
@@ -178,7 +181,7 @@ def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
     random = np.random.default_rng(seed)
     angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
     origins = [
-        f'<origin xyz="{words(x)}" rpy="{words(a)}"/>'
+        f'<origin xyz="{format_vector(x)}" rpy="{format_vector(a)}"/>'
         for x, a in zip(offsets, angles, strict=True)
     ]
 
@@ -289,7 +292,7 @@ def test_files_named_in_the_text_stay_closed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "arguments"),
     [
         ('<mass value="2"/>', '<mass value="-2"/>', ["link 'upper'", "-2 kg"]),
         ('<mass value="2"/>', '<mass value="0"/>', ["link 'upper'", "no mass"]),
@@ -339,15 +342,15 @@ def test_files_named_in_the_text_stay_closed() -> None:
         ),
     ],
 )
-def test_mistakes_are_refused_with_a_remedy(old: str, new: str, words: list[str]) -> None:
+def test_mistakes_are_refused_with_a_remedy(old: str, new: str, arguments: list[str]) -> None:
     assert old in TWO
     text = TWO.replace(old, new) if old == "robot" else TWO.replace(old, new, 1)
     message = refusal(text)
-    assert [word for word in words if word not in message] == []
+    assert [word for word in arguments if word not in message] == []
 
 
 @pytest.mark.parametrize(
-    ("text", "ends", "words"),
+    ("text", "ends", "arguments"),
     [
         (TWO, {"base": "bass"}, ["'bass'", "did you mean 'base'"]),
         (TWO, {"tip": "lowr"}, ["'lowr'", "did you mean 'lower'"]),
@@ -361,9 +364,9 @@ def test_mistakes_are_refused_with_a_remedy(old: str, new: str, words: list[str]
         (GRIPPER.replace("prismatic", "planar"), {"tip": "finger"}, ["joint 'left'", "planar"]),
     ],
 )
-def test_ends_without_arm_are_refused(text: str, ends: dict, words: list[str]) -> None:
+def test_ends_without_arm_are_refused(text: str, ends: dict, arguments: list[str]) -> None:
     message = refusal(text, **ends)
-    assert [word for word in words if word not in message] == []
+    assert [word for word in arguments if word not in message] == []
 
 
 def test_thirteen_joints_are_one_too_many() -> None:

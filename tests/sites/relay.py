@@ -1,8 +1,9 @@
-"""Many members on one clock, one at a time: live loops beside each other, and yet the same run every time.
+"""Many members on one clock, one at a time: live loops beside each other, with the same run
+every time.
 
-Whoever sleeps hands over to the one whose deadline is next; equal deadlines go in order of joining. Work
-takes no time, so that nobody is ever late, unless a test says `stall`. Members are greenlets of one thread:
-to hand over costs less than a microsecond.
+A member that sleeps hands over to the member whose deadline is next; equal deadlines go in
+order of joining. Work takes no time, so that no member is ever late, unless a test uses
+`stall`. Members are greenlets of one thread: to hand over costs less than a microsecond.
 """
 
 import heapq

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.truth import judged, members, offset_errors
+from tests.truth import judge_link, members, offset_errors
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
@@ -64,7 +64,7 @@ def test_logged_delays_and_offsets_are_within_bounds(skewed: tuple[Session, Log]
     _, log = skewed
     for site in log.sites:
         for peer in log.scenario.peers(site):
-            samples = judged(log, site, peer)
+            samples = judge_link(log, site, peer)
             assert len(samples.tick) > 2000
             assert samples.inside == 1.0
             assert samples.bound_us[-1] < 50.0

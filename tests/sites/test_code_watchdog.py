@@ -55,7 +55,7 @@ def fail_of(site: str, law: str) -> Callable[[int, str], Exception]:
     return lambda k, problem: LawFailed(problem, site=site, code=law, tick=k)
 
 
-def ended(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
+def run_steps(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
     overtime = overtime or steps.overtime()
     for k in range(TICKS):
         try:
@@ -69,7 +69,7 @@ def ended(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
 def test_a_laws_overtime_adds_up_to_500_ms(share: float) -> None:
     took_ns = int(share * PERIOD_NS)
     over_ns = min(took_ns, HICCUP_NS) - int(SHARE * PERIOD_NS)
-    k = ended(Steps(lambda _: took_ns))
+    k = run_steps(Steps(lambda _: took_ns))
     if over_ns <= 0 or OVERTIME_LIMIT_NS / over_ns > TICKS:
         assert k is None
     else:
@@ -78,7 +78,7 @@ def test_a_laws_overtime_adds_up_to_500_ms(share: float) -> None:
 
 def test_alternately_slow_laws_are_found() -> None:
     """2.5 periods and nothing, by turns: 1.25 on average, and never twice in a row."""
-    k = ended(Steps(lambda k: 2_500_000 * (k % 2)))
+    k = run_steps(Steps(lambda k: 2_500_000 * (k % 2)))
     assert k == pytest.approx(OVERTIME_LIMIT_NS / (0.5 * PERIOD_NS), abs=3)
 
 
@@ -86,23 +86,23 @@ def test_alternately_slow_laws_are_found() -> None:
 def test_single_hiccups_are_only_counted(hiccup_ns: int) -> None:
     steps = Steps(lambda k: hiccup_ns if k == 700 else 200_000)
     overtime = steps.overtime()
-    assert ended(steps, overtime) is None
+    assert run_steps(steps, overtime) is None
     assert (overtime.hiccups, overtime.longest_tick, overtime.longest_ns) == (1, 700, hiccup_ns)
     assert "in 1 call;" in overtime.describe_hiccups()
 
 
 def test_a_busy_machine_is_no_laws_fault() -> None:
-    assert ended(Steps(lambda _: 5_000_000, computes=0.05, evicts=1)) is None
+    assert run_steps(Steps(lambda _: 5_000_000, computes=0.05, evicts=1)) is None
 
 
 def test_laws_that_wait_are_slow() -> None:
-    assert ended(Steps(lambda _: 5_000_000, computes=0.0)) is not None
+    assert run_steps(Steps(lambda _: 5_000_000, computes=0.0)) is not None
 
 
 def test_punctual_laws_get_no_report() -> None:
     steps = Steps(lambda _: 700_000)
     overtime = steps.overtime()
-    assert ended(steps, overtime) is None
+    assert run_steps(steps, overtime) is None
     assert overtime.describe_hiccups() == ""
 
 

@@ -29,7 +29,7 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessStarter
         yield starter
 
 
-def ended(starter: ProcessStarter, process: SessionProcess) -> SessionProcess:
+def wait_for_end(starter: ProcessStarter, process: SessionProcess) -> SessionProcess:
     until(lambda: starter.poll() or process.code is not None)
     return process
 
@@ -50,8 +50,10 @@ def parent(pid: int) -> int:
 
 
 def test_processes_run_their_words(starter: ProcessStarter, tmp_path: Path) -> None:
-    shown = ended(starter, starter.start("show", ["scenario", "show", "paper"]))
-    refused = ended(starter, starter.start("site", ["site", "m9", "--scenario", "paper"]))
+    shown = wait_for_end(starter, starter.start("show", ["scenario", "show", "paper"]))
+    refused = wait_for_end(
+        starter, starter.start("site", ["site", "m9", "--scenario", "paper"])
+    )
     assert (shown.code, shown.problem()) == (0, None)
     assert shown.output.read_text() == trilat("scenario", "show", "paper", cwd=tmp_path).out
     assert refused.code == 2
@@ -69,21 +71,21 @@ def test_processes_have_own_name_session_and_signals(starter: ProcessStarter) ->
     )
     assert os.getsid(process.pid) == process.pid
     process.end(signal.SIGINT)
-    assert (ended(starter, process).code, process.problem()) == (130, None)
+    assert (wait_for_end(starter, process).code, process.problem()) == (130, None)
     process.end(signal.SIGKILL)  # it has ended: nobody gets that
 
 
 def test_a_killed_process_is_named_with_its_signal(starter: ProcessStarter) -> None:
     process = waiting(starter, "m1")
     os.kill(int(process.pid or 0), signal.SIGKILL)
-    assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+    assert wait_for_end(starter, process).problem() == "m1 was killed by SIGKILL"
 
 
 def test_unstarted_processes_end_with_their_starter(tmp_path: Path) -> None:
     with closing(started(tmp_path)) as starter:
         process = starter.start("m1", WAITS)
         process.end(signal.SIGINT)
-        assert ended(starter, process).problem() is None
+        assert wait_for_end(starter, process).problem() is None
 
 
 def test_interrupted_starters_are_no_problem(tmp_path: Path) -> None:
@@ -107,14 +109,16 @@ def test_signals_before_the_handler_end_copies(tmp_path: Path) -> None:
         for n in range(10):
             processes.append(starter.start(f"m{n}", WAITS))
             processes[-1].end(signal.SIGINT)
-        assert [ended(starter, process).problem() for process in processes] == [None] * 10
+        assert [wait_for_end(starter, process).problem() for process in processes] == [
+            None
+        ] * 10
 
 
 def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
     with closing(started(tmp_path)) as starter:
         process = waiting(starter, "m1")
         os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
-        assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+        assert wait_for_end(starter, process).problem() == "m1 was killed by SIGKILL"
     until(lambda: not is_running(int(process.pid or 0)))
 
 
@@ -127,7 +131,7 @@ def test_processes_end_with_their_requester(tmp_path: Path) -> None:
 
 def test_failing_starters_give_their_reason(tmp_path: Path) -> None:
     with closing(ProcessStarter(tmp_path / "absent.toml", tmp_path)) as starter:
-        process = ended(starter, starter.start("m1", WAITS))
+        process = wait_for_end(starter, starter.start("m1", WAITS))
     assert "absent.toml" in str(process.problem())
 
 
@@ -145,5 +149,8 @@ def test_no_user_code_runs_in_the_starter(
     law = f'law = "mylaw:{name_skeleton_class("mylaw", "law")}"'
     (tmp_path / "own.toml").write_text(read_shipped("paper").replace('law = "adaptive"', law))
     with closing(ProcessStarter(tmp_path / "own.toml", tmp_path)) as starter:
-        assert ended(starter, starter.start("show", ["scenario", "show", "paper"])).code == 0
+        assert (
+            wait_for_end(starter, starter.start("show", ["scenario", "show", "paper"])).code
+            == 0
+        )
     assert not (tmp_path / "imported").exists()

@@ -193,7 +193,7 @@ def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("late_ns", "every", "held"),
+    ("late_ns", "stride", "held"),
     [
         (400_000, 10, [True]),
         (
@@ -205,9 +205,9 @@ def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         (2_000_000, 400, [True]),
     ],
 )
-def test_rates_hold_if_ticks_begin_in_time(late_ns: int, every: int, held: list[bool]) -> None:
+def test_rates_hold_if_ticks_begin_in_time(late_ns: int, stride: int, held: list[bool]) -> None:
     """One tick in a hundred may begin in the second half of its period, or later."""
-    found = doctor.rehearse_rates(UnpunctualClock(late_ns, every))
+    found = doctor.rehearse_rates(UnpunctualClock(late_ns, stride))
     assert [doctor.is_held(*one[:2]) for one in found] == held
     assert [rate_hz for rate_hz, _, _ in found] == list(doctor.RATES_HZ[: len(held)])
     assert found[0][2] == late_ns // 1000

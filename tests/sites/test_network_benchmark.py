@@ -117,7 +117,7 @@ def test_measured_links_add_their_play_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "fact"),
+    ("arguments", "fact"),
     [
         (["--figure", "a.png"], "--figure: can be used only with --benchmark"),
         (["--benchmark", "free", "--count", "9"], "--count: cannot be used with --benchmark"),
@@ -129,12 +129,12 @@ def test_measured_links_add_their_play_out() -> None:
         (["--benchmark", "free", "--seconds", "0"], "--seconds"),
     ],
 )
-def test_meaningless_settings_are_refused(words: list[str], fact: str, tmp_path) -> None:
-    trilat("ping", *words, cwd=tmp_path).refuses(fact)
+def test_meaningless_settings_are_refused(arguments: list[str], fact: str, tmp_path) -> None:
+    trilat("ping", *arguments, cwd=tmp_path).refuses(fact)
 
 
-def check_result(found: Result, transports: list[str]) -> None:
-    facts = found.to_dict()
+def check_result(result: Result, transports: list[str]) -> None:
+    facts = result.to_dict()
     assert [one["transport"] for one in facts["transports"]] == transports
     assert len(facts["rows"]) == 6 * len(transports)
     assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
@@ -146,10 +146,10 @@ def check_result(found: Result, transports: list[str]) -> None:
             or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
         )
     assert is_documented("ping --benchmark", facts)
-    assert facts["connect"] or found.summary().startswith(
+    assert facts["connect"] or result.summary().startswith(
         "this machine alone, without a network"
     )
-    assert len(found.to_frame()) == len(facts["rows"])
+    assert len(result.to_frame()) == len(facts["rows"])
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 
 from sites.peer_monitor import PeerMonitor
 from tests.net.local_bus import LocalBus, LocalNetwork
-from tests.net.parties import told
+from tests.net.parties import answer_info
 from trilat_net.net import topics
 from trilat_net.net.membership import EventPublisher, liveliness_token, read_messages
 from trilat_net.net.messages import Event
@@ -22,7 +22,7 @@ class Desk:
         self.network = LocalNetwork()
         self._heard = self.network.join().inbox(topics.key("t", "m1", topics.EVENT))
         bus = self.network.join()
-        self._publisher = EventPublisher(bus, "t", told("m1", 1))
+        self._publisher = EventPublisher(bus, "t", answer_info("m1", 1))
         self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
         self.company.boots = BOOTS
 

@@ -4,7 +4,7 @@ import pytest
 
 from tests.json_outline import is_documented
 from tests.net.manual_clock import ManualClock
-from tests.net.parties import SESSION, Member, Party, told
+from tests.net.parties import SESSION, Member, Party, answer_info
 from trilat_net.app.session_ping import GATHERING_NS, ping_topic
 from trilat_net.errors import RunFailed
 from trilat_net.net import topics
@@ -54,7 +54,7 @@ def test_members_without_answer_lack_their_clock() -> None:
     for _ in range(20):
         visit.probe.poll()
         while (question := questions.poll()) is not None:
-            question.reply(encode(told("s", 9, clock="far away")))
+            question.reply(encode(answer_info("s", 9, clock="far away")))
         party.clock.sleep_until(party.clock.monotonic_ns() + S // 10)
     facts = visit.look().report().members[-1]
     assert (facts["member"], facts["answers"]) == ("s", 0)

@@ -44,6 +44,6 @@ def value(figures: RunMetrics, key: str, n: int = 0) -> float:
     return figures.windows[n][key].most
 
 
-def printed(figure: float, digit: float) -> Any:
+def approximate_figure(figure: float, digit: float) -> Any:
     """Returns an approximation within the last printed digit or 2 %, whichever is larger."""
     return pytest.approx(figure, abs=max(digit, 0.02 * abs(figure)))

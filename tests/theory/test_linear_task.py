@@ -155,12 +155,12 @@ def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> 
     return made[:, made.any(axis=0)]
 
 
-def realise(made: Array, step_s: float, order: int) -> Array:
+def realise(outputs: Array, step_s: float, order: int) -> Array:
     """Returns the exponents in a free motion of many signals: Juang and Pappa's eigensystem
     realisation (1985).
     """
-    half = len(made) // 2
-    hankel = np.stack([np.concatenate(made[k : k + half]) for k in range(half)], axis=1)
+    half = len(outputs) // 2
+    hankel = np.stack([np.concatenate(outputs[k : k + half]) for k in range(half)], axis=1)
     U, sizes, V = np.linalg.svd(hankel[:, :-1], full_matrices=False)
     U, sizes, V = U[:, :order], np.sqrt(sizes[:order]), V[:order]
     step = (U / sizes).T @ hankel[:, 1:] @ (V / sizes[:, np.newaxis]).T

@@ -29,8 +29,8 @@ def linear(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
     )
 
 
-def roots(found: Spectrum) -> Array:
-    return np.array([root.s for root in found.roots])
+def roots(spectrum: Spectrum) -> Array:
+    return np.array([root.s for root in spectrum.roots])
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])

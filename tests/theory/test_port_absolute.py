@@ -22,7 +22,7 @@ POSITIVE = st.floats(0.1, 10.0)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def drawn(seed: int, ports: int, count: int = 40) -> Complex:
+def draw_networks(seed: int, ports: int, count: int = 40) -> Complex:
     """Draws networks about the edge of absolute stability, off-diagonal entries of very different size."""
     rng = np.random.default_rng(seed)
     Y = rng.normal(size=(count, ports, ports)) + 1j * rng.normal(size=(count, ports, ports))
@@ -54,7 +54,7 @@ def test_delayed_p_d_fails_below_its_sine(d: float) -> None:
 
 @given(seed=SEEDS)
 def test_the_criterion_equals_its_three_inequalities(seed: int) -> None:
-    Y = drawn(seed, 2)
+    Y = draw_networks(seed, 2)
     Y[::3, 0, 0] -= 0.4
     for parameters in (Y, np.linalg.inv(Y)):
         a, b, through = (
@@ -76,7 +76,7 @@ def test_llewellyns_parameter_is_at_most_minus_one() -> None:
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS)
 def test_for_two_ports_weights_match_llewellyn(seed: int) -> None:
-    Y = drawn(seed, 2)
+    Y = draw_networks(seed, 2)
     weights = find_best_weights(Y, np.array([0, 1]))
     parameter = llewellyn_parameter(Y)
     clear = np.abs(weights.margin) > 1e-4
@@ -115,7 +115,7 @@ def test_for_three_ports_weights_are_exact(seed: int) -> None:
     """Necessary and sufficient: a search among passive loads finds one where and only where no
     weights do.
     """
-    Y = drawn(seed, 3)
+    Y = draw_networks(seed, 3)
     margin = find_best_weights(Y, np.array([0, 1, 2])).margin
     clear = np.abs(margin) > 0.05
     np.testing.assert_array_equal(destabilised(Y[clear]), margin[clear] < 0.0)
@@ -124,7 +124,7 @@ def test_for_three_ports_weights_are_exact(seed: int) -> None:
 @settings(max_examples=10, deadline=None)
 @given(seed=SEEDS)
 def test_no_weights_of_a_fine_grid_do_better(seed: int) -> None:
-    Y = drawn(seed, 6, count=3)
+    Y = draw_networks(seed, 6, count=3)
     owner = np.array([0, 0, 1, 1, 2, 2])
     weights = find_best_weights(Y, owner)
     size = np.ones((3, 6))
@@ -154,7 +154,7 @@ def test_one_site_needs_no_weights() -> None:
 @given(seed=SEEDS)
 def test_remaining_ports_are_part_of_matrices(seed: int) -> None:
     """Free: rows and columns of Y fall away. Clamped: those of Z."""
-    Y = drawn(seed, 3)
+    Y = draw_networks(seed, 3)
     np.testing.assert_array_equal(clamp_ports(Y, [0, 2], []), Y[:, [0, 2]][:, :, [0, 2]])
     Z = np.linalg.inv(Y)
     np.testing.assert_allclose(

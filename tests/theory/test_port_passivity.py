@@ -26,7 +26,7 @@ POSITIVE = st.floats(0.1, 10.0)
 OR_NONE = st.just(0.0) | POSITIVE
 
 
-def judged(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
+def judge_passivity(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
     Y = build_admittance(network.loop)
     w = refine_frequencies(
         Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop))
@@ -50,7 +50,7 @@ def test_masses_springs_and_dampers_are_passive(
     wires = [
         Wire(a, b, K, B) for n, (K, B) in enumerate(links) for a, b in ((n, n + 1), (n + 1, n))
     ]
-    found = judged(Network(m, d, k, tuple(wires)))
+    found = judge_passivity(Network(m, d, k, tuple(wires)))
     assert found.passive
     assert found.lacking_nm_s_rad == 0.0
 
@@ -58,7 +58,7 @@ def test_masses_springs_and_dampers_are_passive(
 @settings(max_examples=20, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 1.0))
 def test_a_delay_without_damping_is_not_passive(K: float, delay_s: float) -> None:
-    assert not judged(pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
+    assert not judge_passivity(pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
 
 
 @pytest.mark.parametrize("T", [(0.2, 0.2), (0.1, 0.5), (0.0, 0.3)])
@@ -73,28 +73,28 @@ def test_p_d_is_passive_from_the_published_damping(
         first = np.sqrt(product * factor) * share
         network = pair(K, (first, product * factor / first), T)
         # dampers of different size pass the damping on: their share of the weight cancels
-        assert judged(network, (1.0 / K[0], 1.0 / K[1])).passive is holds
+        assert judge_passivity(network, (1.0 / K[0], 1.0 / K[1])).passive is holds
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.5, 1.9])
 def test_p_d_lacks_k_t_less_its_damping(d: float) -> None:
     """-1/2 lambda_min(Z + Z^H) = K abs(sin(w T)) / w - d, most at w = 0: K T - d."""
-    assert judged(pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(2.0 - d, rel=1e-4)
+    assert judge_passivity(pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(2.0 - d, rel=1e-4)
 
 
 @settings(max_examples=15, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 0.5))
 def test_the_lacking_damping_is_just_enough_for_passivity(K: float, delay_s: float) -> None:
-    lacking = judged(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
+    lacking = judge_passivity(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
     for factor, holds in ((0.98, False), (1.02, True)):
         d = (0.1 + factor * lacking, 0.2 + factor * lacking)
         if lacking > 0.0:
-            assert judged(pair((K, K), d, (delay_s, delay_s))).passive is holds
+            assert judge_passivity(pair((K, K), d, (delay_s, delay_s))).passive is holds
 
 
 def test_the_active_range_follows_its_sine() -> None:
     """d = K abs(sin(w T)) / w."""
-    (span,) = judged(pair(d=(1.0, 1.0))).minima.below
+    (span,) = judge_passivity(pair(d=(1.0, 1.0))).minima.below
     w = 2.0 * np.pi * span.to_hz
     assert np.sin(0.2 * w) / w == pytest.approx(0.1, rel=1e-6)
     assert span.from_hz == pytest.approx(1e-3)

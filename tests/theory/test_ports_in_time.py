@@ -29,7 +29,7 @@ def fitted(t_s: Array, values: Array, w_rad_s: float) -> Complex:
     return np.asarray(found[0] + 1j * found[1], dtype=np.complex128)
 
 
-def answered(
+def measure_admittance(
     name: str,
     overrides: dict[str, Any],
     joint: int,
@@ -61,7 +61,7 @@ def test_p_d_answers_sinusoids_by_its_admittance(hz: float, joint: int) -> None:
             derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
         )
     )(np.array([2.0 * np.pi * hz]))[0]
-    found = answered("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
+    found = measure_admittance("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
     assert np.abs(found - Y[:, joint - 1]).max() < 0.01 * np.abs(Y[:, joint - 1]).max()
     assert (np.abs(found - Y[:, joint - 1]) < 0.01 * np.abs(Y[:, joint - 1])).all()
 
@@ -91,5 +91,7 @@ def test_paper_law_answers_by_its_admittance(hz: float) -> None:
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
     Y = build_admittance(hold_by_spring(bare, "m", 20.0, 3.0))(np.array([2.0 * np.pi * hz]))[0]
-    found = answered("two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0)
+    found = measure_admittance(
+        "two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0
+    )
     assert (np.abs(found - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()

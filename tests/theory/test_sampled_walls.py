@@ -67,7 +67,7 @@ def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:
     assert found is None or found.value > bound > 0.0
 
 
-def say(K: float) -> CellClass:
+def classify_stiffness(K: float) -> CellClass:
     """Returns the class of a sweep's cell, which counts growth in contact by the same map."""
     return classify_cell(windup(K).text, 480.0).verdict
 
@@ -82,8 +82,8 @@ def test_runs_have_the_edge_of_the_map() -> None:
     """Stable 5 % below the edge, and not 5 % above, which shows without the map too."""
     found = edge()
     assert found is not None
-    assert say(0.95 * found.value) is CellClass.CONVERGED
-    assert say(1.05 * found.value) is not CellClass.CONVERGED
+    assert classify_stiffness(0.95 * found.value) is CellClass.CONVERGED
+    assert classify_stiffness(1.05 * found.value) is not CellClass.CONVERGED
     assert end_alone(0.95 * found.value) is Stability.SETTLED
     assert end_alone(1.05 * found.value) is Stability.NOT_STABLE
 
@@ -92,7 +92,7 @@ def test_runs_have_the_edge_of_the_map() -> None:
 def test_the_sweep_over_stiffness_is_monotone() -> None:
     """1 to 40 kN/m: stable up to 15, and from 16 on never."""
     for stable in (
-        [say(1e3 * K) is CellClass.CONVERGED for K in range(1, 41)],
+        [classify_stiffness(1e3 * K) is CellClass.CONVERGED for K in range(1, 41)],
         [end_alone(1e3 * K) is Stability.SETTLED for K in range(1, 41)],
     ):
         assert stable == [K <= 15 for K in range(1, 41)]

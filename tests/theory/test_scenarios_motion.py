@@ -14,7 +14,7 @@ A figure "at t" is the largest |e| of the two seconds from t on.
 import numpy as np
 import pytest
 
-from tests.theory.figures_of_runs import Overrides, measured, peak, printed, value
+from tests.theory.figures_of_runs import Overrides, approximate_figure, measured, peak, value
 from tests.virtual_runs import sampled
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
@@ -50,7 +50,7 @@ SETTLED_S = {
 def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
     fused_run = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
     fused_run.advance_to(30.0)
-    assert fused_run.settled_s == printed(settled_s, 0.1)
+    assert fused_run.settled_s == approximate_figure(settled_s, 0.1)
 
 
 @pytest.mark.long
@@ -62,7 +62,10 @@ def test_free_motions_error_grows_with_delay() -> None:
     ]
     rms = [float(np.sqrt(((run[..., :2] - run[..., 4:6]) ** 2).mean())) for run in runs]
     assert rms == sorted(rms)
-    assert (rms[0], rms[-1]) == (printed(0.1064, 1e-4), printed(0.1259, 1e-4))
+    assert (rms[0], rms[-1]) == (
+        approximate_figure(0.1064, 1e-4),
+        approximate_figure(0.1259, 1e-4),
+    )
     inertia = [run[0, -1, 12] for run in runs]  # theta_hat_1 of the first site
     assert np.ptp(inertia) > 0.1
 
@@ -76,7 +79,7 @@ def test_about_one_rest_some_delay_damps_common_motion(
 ) -> None:
     analysis = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
     assert analysis.decisive.rightmost is not None
-    assert analysis.decisive.rightmost.s.real == printed(rate_per_s, 0.001)
+    assert analysis.decisive.rightmost.s.real == approximate_figure(rate_per_s, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +106,10 @@ def test_the_papers_hands_hardly_move_joint_1() -> None:
 @pytest.mark.long
 def test_without_a_box_the_slave_returns() -> None:
     made = measured("box", NO_BOX)
-    assert made.end_pose_rad["s"] == (printed(-0.011, 1e-3), printed(0.005, 1e-3))
+    assert made.end_pose_rad["s"] == (
+        approximate_figure(-0.011, 1e-3),
+        approximate_figure(0.005, 1e-3),
+    )
 
 
 @pytest.mark.long
@@ -119,7 +125,7 @@ def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) 
     row = {"m1": share, "m2": 1.0 - share}
     overrides: Overrides = {"timeline": [], "dominance.s": row, "duration_s": 10.0}
     made = measured("training", overrides, (9.9, 10.0, "s"))
-    assert value(made, "q1_rad") + 0.6 == printed(offset_rad, 1e-3)
+    assert value(made, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
 
 
 HEALED = (6.0, 15.0, "s")
@@ -128,11 +134,11 @@ HEALED = (6.0, 15.0, "s")
 @pytest.mark.long
 def test_healing_links_kick_slaves_that_continued() -> None:
     made = measured("outage", {}, HEALED)
-    assert value(made, "speed_peak_rad_s") == printed(0.41, 0.01)
-    assert value(made, "torque_peak_nm") == printed(35.0, 1.0)
-    assert made.synchronised_at_s == printed(12.4, 0.1)
+    assert value(made, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
+    assert value(made, "torque_peak_nm") == approximate_figure(35.0, 1.0)
+    assert made.synchronised_at_s == approximate_figure(12.4, 0.1)
     uncut = measured("outage", {"link.outages_s": []}, HEALED)
-    assert value(uncut, "torque_peak_nm") == printed(18.8, 0.1)
+    assert value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
 
 
 @pytest.mark.long
@@ -148,22 +154,22 @@ LATE = (9.0, 15.0, "s")
 
 def test_direct_force_reflection_hammers_at_200_ms() -> None:
     made = measured("contact", {}, LATE)
-    assert value(made, "wall_mean_n") == printed(8.0, 1.0)
-    assert value(made, "wall_deviation_n") == printed(14.0, 1.0)
-    assert value(made, "wall_peak_n") == printed(52.0, 1.0)
+    assert value(made, "wall_mean_n") == approximate_figure(8.0, 1.0)
+    assert value(made, "wall_deviation_n") == approximate_figure(14.0, 1.0)
+    assert value(made, "wall_peak_n") == approximate_figure(52.0, 1.0)
     assert value(made, "wall_hits") == 3
 
 
 def test_at_20_ms_there_is_one_hit() -> None:
     made = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
     assert value(made, "wall_hits") == 1
-    assert value(made, "wall_mean_n", 1) == printed(3.3, 0.1)
+    assert value(made, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
     assert value(made, "wall_deviation_n", 1) < 0.01
 
 
 def test_a_fifth_of_the_force_settles() -> None:
     made = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
-    assert value(made, "wall_mean_n") == printed(8.5, 0.1)
+    assert value(made, "wall_mean_n") == approximate_figure(8.5, 0.1)
     assert value(made, "wall_deviation_n") < 0.05
 
 
@@ -310,13 +316,16 @@ def test_half_of_the_margin_grows_to_10_rad() -> None:
     faster_arms = {"limits.qd_limit_rad_s": 100.0}
     changes = {"control.d": 0.5, "duration_s": 40.0, **faster_arms}
     made = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
-    assert [peak(made, 0), peak(made, 1)] == [printed(1.6, 0.1), printed(10.0, 1.0)]
+    assert [peak(made, 0), peak(made, 1)] == [
+        approximate_figure(1.6, 0.1),
+        approximate_figure(10.0, 1.0),
+    ]
 
 
 @pytest.mark.long
 def test_two_and_half_margins_decay_to_milliradians() -> None:
     made = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
-    assert peak(made) == printed(3e-3, 1e-3)
+    assert peak(made) == approximate_figure(3e-3, 1e-3)
 
 
 @pytest.mark.long
@@ -327,10 +336,10 @@ def test_jitter_of_equal_mean_turns_the_verdict() -> None:
         EnvelopeTrend.DECAYS,
         EnvelopeTrend.GROWS,
     )
-    assert peak(jitter) == printed(0.022, 0.001)
-    assert peak(constant) == printed(5.3, 0.1)
+    assert peak(jitter) == approximate_figure(0.022, 0.001)
+    assert peak(constant) == approximate_figure(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]
-    assert ages == [printed(25.0, 1.0)] * len(ages)
+    assert ages == [approximate_figure(25.0, 1.0)] * len(ages)
     assert {age.mean_ms for age in constant.ages.values()} == {200.0}
 
 
@@ -338,7 +347,7 @@ def test_jitter_of_equal_mean_turns_the_verdict() -> None:
 def test_play_out_makes_the_jittered_run_diverge() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
     free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
-    assert peak(free) == printed(339.0, 1.0)
+    assert peak(free) == approximate_figure(339.0, 1.0)
     assert {age.max_ms for age in free.ages.values()} == {400.0}
     assert free.peak_speed_rad_s is not None
     assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s

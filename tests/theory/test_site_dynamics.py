@@ -28,15 +28,15 @@ seeds = st.integers(0, 2**32 - 1)
 laws = st.sampled_from(["adaptive", "known"])
 
 
-def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
+def by_leaves(site_setup: SiteSetup, x: Array) -> dict[str, Array]:
     """Returns the rates as a tick computes them: errors, regressor, torque, external torques,
     forward dynamics.
     """
-    gains = one.gains
+    gains = site_setup.gains
     q, qd = x[AT.q], x[AT.qd]
     Lambda = np.broadcast_to(gains.Lambda, 2)
     e, ed, r = control.control_errors(q, qd, x[AT.q_des], x[AT.qd_des], Lambda)
-    Y = regressor(one.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
+    Y = regressor(site_setup.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
     wide = np.inf
     Kp, Kd, K, d, k_f = (
         np.zeros(2) + gain for gain in (gains.Kp, gains.Kd, gains.K, gains.d, gains.k_f)
@@ -47,18 +47,20 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
         estimate = -np.asarray(gains.Gamma) * control.regressor_transpose_times(Y, r)
     else:
         tau = control.damped_torque(
-            known, one.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide
+            known, site_setup.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide
         )
         estimate = np.zeros(5)
-    rows, table = torque_source_rows(one.actors)
+    rows, table = torque_source_rows(site_setup.actors)
     acted, held = (
         np.array(
-            torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled)[:2]
+            torque_on_arm(LATE_S, q, qd, np.array(site_setup.lengths_m), rows, table, sampled)[
+                :2
+            ]
         )
         for sampled in (0, 1)
     )
     total = np.array(tau) + acted + held + x[AT.external_torque]
-    qdd = np.array(forward_dynamics(one.theta, one.g_m_s2, q, qd, total))
+    qdd = np.array(forward_dynamics(site_setup.theta, site_setup.g_m_s2, q, qd, total))
     return {
         "qdd": qdd,
         "estimate": estimate,

@@ -36,7 +36,7 @@ def peer(t: float) -> tuple[Vector, Vector, Vector]:
     )
 
 
-def place(q: Vector) -> Vector:
+def tip_place(q: Vector) -> Vector:
     both = q[0] + q[1]
     return np.array([np.cos(q[0]) + np.cos(both), np.sin(q[0]) + np.sin(both)])
 
@@ -69,7 +69,7 @@ def inertia(q: Vector) -> Vector:
 
 
 def reference(q: Vector, x_des: Vector) -> Vector:
-    return np.linalg.solve(jacobian(q), -LAMBDA * (place(q) - x_des))
+    return np.linalg.solve(jacobian(q), -LAMBDA * (tip_place(q) - x_des))
 
 
 def loop(
@@ -93,7 +93,7 @@ def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
         state = moves(t)
         q, qd, theta_hat, stored = state[:2], state[2:4], state[4:9], state[9]
         x_des = peer(t - T)[0]
-        r, e = qd - reference(q, x_des), place(q) - x_des
+        r, e = qd - reference(q, x_des), tip_place(q) - x_des
         off = theta_hat - THETA
         return float(
             0.5 * r @ inertia(q) @ r

@@ -94,7 +94,7 @@ def parameters(name: str) -> Array:
     return np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints])
 
 
-def apart(got: Array, wanted: Array) -> float:
+def largest_difference(got: Array, wanted: Array) -> float:
     return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
 
 
@@ -107,14 +107,14 @@ def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
         Y = placed.regressor_matrix(state.qd, state.v, state.a)
         qdd = placed.joint_acceleration(theta, state.qd, state.tau)
         M = placed.inertia_matrix(theta)
-        assert apart(torque, state.inverse_dynamics) <= 1e-12
-        assert apart(Y.T @ state.r, state.regressor_transpose_r) <= 1e-12
-        assert apart(M, state.inertia) <= 1e-12
-        assert apart(qdd, state.forward_dynamics) <= 100 * np.finfo(float).eps * np.linalg.cond(
-            M
-        )
-        assert apart(placed.end_effector_position(), state.tip_position) <= 1e-12
-        assert apart(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
+        assert largest_difference(torque, state.inverse_dynamics) <= 1e-12
+        assert largest_difference(Y.T @ state.r, state.regressor_transpose_r) <= 1e-12
+        assert largest_difference(M, state.inertia) <= 1e-12
+        assert largest_difference(qdd, state.forward_dynamics) <= 100 * np.finfo(
+            float
+        ).eps * np.linalg.cond(M)
+        assert largest_difference(placed.end_effector_position(), state.tip_position) <= 1e-12
+        assert largest_difference(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
 
 
 def test_columns_are_separate_chains() -> None:
@@ -130,14 +130,17 @@ def test_columns_are_separate_chains() -> None:
         *both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1)
     )
     for n, one in enumerate((first, second)):
-        assert apart(found[:, n], acceleration(one.q, one.qd, one.tau, theta)) <= 1e-12
+        assert (
+            largest_difference(found[:, n], acceleration(one.q, one.qd, one.tau, theta))
+            <= 1e-12
+        )
     for k in range(7):
         off = 1e-6 * np.eye(7)[k]
         ahead, behind = (
             acceleration(first.q + way * off, first.qd, first.tau, theta) for way in (1, -1)
         )
         exact = acceleration(first.q + 1e-24j * off, first.qd, first.tau, theta).imag / 1e-30
-        assert apart(exact, (ahead - behind) / 2e-6) <= 1e-6
+        assert largest_difference(exact, (ahead - behind) / 2e-6) <= 1e-6
 
 
 @pytest.mark.parametrize("name", ["random3", "arm7"])
@@ -148,7 +151,7 @@ def test_drives_and_stops_equal_compiled_leaves(name: str) -> None:
         place_joints(rows, state.q)
         find_acceleration(rows, theta, state.gravity, state.q, state.qd, state.tau, qdd)
         found = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
-        assert apart(found, qdd) <= 1e-11
+        assert largest_difference(found, qdd) <= 1e-11
 
 
 def test_planar_arms_are_two_joint_chains() -> None:
@@ -173,10 +176,15 @@ def test_planar_arms_are_two_joint_chains() -> None:
         np.outer(values, np.ones(6)) for values in (np.concatenate(bodies), theta)
     )
     assert (
-        apart(
+        largest_difference(
             placed.required_torque(of_chain, qd, v, a), planar.required_torque(of_arm, qd, v, a)
         )
         <= 1e-12
     )
-    assert apart(placed.gravity_torque(of_chain), planar.gravity_torque(of_arm)) <= 1e-12
-    assert apart(placed.position_jacobian()[:2], planar.position_jacobian()) <= 1e-12
+    assert (
+        largest_difference(placed.gravity_torque(of_chain), planar.gravity_torque(of_arm))
+        <= 1e-12
+    )
+    assert (
+        largest_difference(placed.position_jacobian()[:2], planar.position_jacobian()) <= 1e-12
+    )

@@ -72,7 +72,7 @@ def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
     return scenario.setup(site)._replace(tau_limit_nm=(1e9,), qd_limit_rad_s=(1e9,))
 
 
-def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
+def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array]]:
     """Draws the state of a site, and of each peer its pose, velocity and torque, with poses
     about `apart` away.
     """
@@ -88,9 +88,9 @@ def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
     ).x
     peers = []
     for _ in site.links:
-        pose = own + np.concatenate([rng.normal(0.0, apart, 3), np.zeros(len(own) - 3)])
+        pose = own + np.concatenate([rng.normal(0.0, distance, 3), np.zeros(len(own) - 3)])
         if len(own) > 3:
-            turned = Rotation.from_rotvec(rng.normal(0.0, apart, 3)) * Rotation.from_rotvec(
+            turned = Rotation.from_rotvec(rng.normal(0.0, distance, 3)) * Rotation.from_rotvec(
                 own[3:]
             )
             pose[3:] = turned.as_rotvec()
@@ -137,14 +137,14 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
-@pytest.mark.parametrize("apart", [0.3, 0.0])
-def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, apart: float) -> None:
+@pytest.mark.parametrize("distance", [0.3, 0.0])
+def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance: float) -> None:
     """Its torque, its messages, its motion and its learning, for peers that are apart and for
     peers that agree.
     """
     site = build(text, name, law)
     for seed in range(3):
-        state, peers = draw(site, seed, apart)
+        state, peers = draw(site, seed, distance)
         found, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
         names = {"tau": found.tau, "x": found.x, "xd": found.xd, "wrench": -found.reflected}
         for key, value in names.items():

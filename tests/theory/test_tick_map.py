@@ -97,7 +97,7 @@ def test_small_deviations_follow_runs_tick_by_tick(
         f"{site}.q{j + 1}": off[i, j]
         for (i, site), j in itertools.product(enumerate("ms"), range(2))
     }
-    X = begun(
+    X = start_state(
         whole,
         late,
         names,
@@ -117,7 +117,7 @@ def test_small_deviations_follow_runs_tick_by_tick(
         assert np.abs(X[places] - q[k]).max() <= 4e-4 * size, k
 
 
-def begun(
+def start_state(
     whole: Array,
     late: NDArray[np.intp],
     names: Sequence[str],

@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
-from sweep_tests.quick import asked as plan
+from sweep_tests.quick import SHORT, plan_quick_sweep
 from trial_tests.results import quick
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
@@ -46,14 +45,14 @@ class Cluster:
             and json.loads(file.read_text())["address"]
         )
 
-    def _start(self, *words: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
+    def _start(self, *arguments: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
         log = (self.folder / f"{len(self.processes)}.log").open("wb")
         command = [
             sys.executable,
             "-P",
             "-m",
             "dask",
-            *words,
+            *arguments,
             "--host",
             "127.0.0.1",
             "--no-dashboard",
@@ -91,7 +90,9 @@ def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
     this process.
     """
     (folder / "trio.toml").write_text(SHORT.replace("duration_s = 0.5", "duration_s = 4.0"))
-    sweep = plan(folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0)
+    sweep = plan_quick_sweep(
+        folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0
+    )
     assert sweep.cells == count
     alone = run_sweep(prepare_sweep_folder(sweep, folder / "alone"), 1)
     killed, *_ = [cluster.add_worker() for _ in range(2)]

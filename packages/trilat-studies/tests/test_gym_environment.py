@@ -120,7 +120,7 @@ def test_saved_episodes_name_a_program_as_mover(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("vary", "words"),
+    ("vary", "phrase"),
     [
         ({"link.dely_ms": (0.0, 300.0)}, "did you mean 'delay_ms'"),
         ({"link.delay_ms": (0.0, -300.0)}, "delay_ms: expected a number >= 0.0"),
@@ -129,9 +129,9 @@ def test_saved_episodes_name_a_program_as_mover(tmp_path: Path) -> None:
     ],
 )
 def test_varied_keys_are_checked_before_the_first_episode(
-    vary: dict[str, Any], words: str
+    vary: dict[str, Any], phrase: str
 ) -> None:
-    with pytest.raises((ScenarioError, UsageError), match=words):
+    with pytest.raises((ScenarioError, UsageError), match=phrase):
         tn.make_env("paper", BENT, duration_s=1, vary=vary)
 
 

@@ -35,18 +35,20 @@ def moved_from(site: str, amplitude_nm: float, duration_s: float = 28.0) -> dict
     return {**stiff, **weightless, f"sites.{site}.hands": sines}
 
 
-def drawn(random: np.random.Generator, low: float, high: float) -> Array:
+def draw_gain(random: np.random.Generator, low: float, high: float) -> Array:
     turn = random.uniform(0.0, np.pi)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     found: Array = axes @ np.diag(random.uniform(low, high, 2)) @ axes.T
     return found
 
 
-def held(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
+def identify_drawn_hand(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
     """A hand that is drawn at m1, moved from the slave over a link that delays, jitters and loses."""
     random = np.random.default_rng(seed)
     true = HandMatrices(
-        drawn(random, 0.5, 2.0), drawn(random, 5.0, 25.0), drawn(random, 80.0, 400.0)
+        draw_gain(random, 0.5, 2.0),
+        draw_gain(random, 5.0, 25.0),
+        draw_gain(random, 80.0, 400.0),
     )
     plant = {
         "class": "tests.own_code:HeldArm",
@@ -62,9 +64,10 @@ def held(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
     return true, identify_hand(tn.simulate("free", changes), "m1")
 
 
-def covered(true: HandMatrices, found: HandImpedance) -> Array:
+def covered(true: HandMatrices, hand_impedance: HandImpedance) -> Array:
     rows = [
-        np.abs(getattr(found, k) - one) <= found.halves[k] for k, one in true._asdict().items()
+        np.abs(getattr(hand_impedance, k) - one) <= hand_impedance.halves[k]
+        for k, one in true._asdict().items()
     ]
     return np.array(rows)
 
@@ -113,7 +116,7 @@ def test_json_of_a_hand_is_read_again(spring: HandImpedance, tmp_path: Path) -> 
 
 
 def test_mass_behind_own_motion_is_identified_over_networks() -> None:
-    true, found = held(3, 40.0)
+    true, found = identify_drawn_hand(3, 40.0)
     assert covered(true, found).mean() >= 0.75
     assert np.allclose(found.M, true.M, atol=0.2)
     assert {len(half) for half in dataclasses.asdict(found)["halves"].values()} == {2}
@@ -121,7 +124,7 @@ def test_mass_behind_own_motion_is_identified_over_networks() -> None:
 
 @pytest.mark.long
 def test_intervals_hold_nine_tenths_of_twenty_hands() -> None:
-    assert np.mean([covered(*held(seed, 52.0)) for seed in range(1, 21)]) >= 0.9
+    assert np.mean([covered(*identify_drawn_hand(seed, 52.0)) for seed in range(1, 21)]) >= 0.9
 
 
 @pytest.mark.parametrize(

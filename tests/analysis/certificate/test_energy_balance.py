@@ -389,9 +389,9 @@ def judge(rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object) -> C
     return certify(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
 
 
-def share(found: Certificate, name: str = "residual") -> float:
-    assert found.balance is not None, found.verdict.text
-    return float(np.abs(getattr(found.balance, name)).max() / found.balance.V.max())
+def share(certificate: Certificate, name: str = "residual") -> float:
+    assert certificate.balance is not None, certificate.verdict.text
+    return float(np.abs(getattr(certificate.balance, name)).max() / certificate.balance.V.max())
 
 
 def test_the_balance_closes_with_order_two() -> None:

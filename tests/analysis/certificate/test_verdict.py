@@ -32,13 +32,13 @@ from . import runs
 SHORT = {"duration_s": 4.0, "rate_hz": 200}
 
 
-def made(**overrides: object) -> Log:
+def simulate_free(**overrides: object) -> Log:
     dotted = {key.replace("__", "."): value for key, value in overrides.items()}
     return runs.run("free", {**SHORT, **dotted}).log
 
 
 def test_free_motion_is_covered() -> None:
-    found = certify(made())
+    found = certify(simulate_free())
     assert found.verdict.finding is StabilityFinding.COVERED
     assert found.verdict.text.startswith(
         "covered by the theorem: V did not rise: 29.78 J at 0 s, 12"
@@ -84,7 +84,7 @@ def test_a_rise_names_time_amount_and_cause() -> None:
 
 def test_kd_of_different_shape_makes_v_rise() -> None:
     found = certify(
-        made(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
+        simulate_free(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
     )
     assert found.verdict.finding is StabilityFinding.ROSE
     assert found.verdict.rise is not None
@@ -93,7 +93,9 @@ def test_kd_of_different_shape_makes_v_rise() -> None:
 
 def test_sampling_feeds_a_slow_digital_loop() -> None:
     """T = 0 at 80 Hz: `digital` keeps swinging, because torques are held over a tick."""
-    found = certify(made(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0))
+    found = certify(
+        simulate_free(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0)
+    )
     assert found.verdict.finding is StabilityFinding.ROSE
     assert found.verdict.rise is not None
     assert next(iter(found.verdict.rise.causes)) == "sampling"
@@ -101,7 +103,7 @@ def test_sampling_feeds_a_slow_digital_loop() -> None:
 
 
 def tampered(change: Callable[[State], State]) -> Certificate:
-    return certify(logs.rewritten(made(rate_hz=500, duration_s=2.0), change=change))
+    return certify(logs.rewritten(simulate_free(rate_hz=500, duration_s=2.0), change=change))
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
@@ -271,12 +273,12 @@ def test_v_that_rises_at_the_end_is_named() -> None:
 RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 
 
-def found(data: bytes, **options: float) -> Certificate:
+def certify_bytes(data: bytes, **options: float) -> Certificate:
     return certify(opened(data), **options)
 
 
 def test_a_whole_log_is_stable_with_reasons() -> None:
-    certificate = found(recorded("free", RUN))
+    certificate = certify_bytes(recorded("free", RUN))
     assert certificate.stability is Stability.STABLE
     facts = certificate.to_dict()["evidence"]
     assert facts == {
@@ -301,7 +303,7 @@ def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
     accounts[own] = accounts[own].replace(
         "received 3000, missing 0", "received 2965, missing 35"
     )
-    certificate = found(taken.bytes())
+    certificate = certify_bytes(taken.bytes())
     assert certificate.stability is Stability.OPEN
     assert not certificate.passed
     assert any(
@@ -309,13 +311,13 @@ def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
     )
     assert not certificate.accepts(("bounded",))
     assert certificate.accepts(("open",))
-    assert found(taken.bytes(), min_coverage=0.9).passed
+    assert certify_bytes(taken.bytes(), min_coverage=0.9).passed
 
 
 def test_only_recorded_periods_count_for_v() -> None:
     """Single records of one site: few are missing, and each leaves several periods of V unjudged."""
     data = edited(recorded("free", RUN), record=without("s", set(range(100, 3000, 1000))))
-    certificate = found(data)
+    certificate = certify_bytes(data)
     assert certificate.evidence.coverage.share == 0.999
     assert certificate.evidence.functional_share is not None
     assert certificate.evidence.functional_share < 0.999
@@ -325,7 +327,7 @@ def test_only_recorded_periods_count_for_v() -> None:
 def test_no_option_accepts_a_changed_log() -> None:
     pieces = taken_apart(recorded("free", RUN))
     pieces.metadata("trilat.session")["seed"] += "0"
-    certificate = found(pieces.bytes())
+    certificate = certify_bytes(pieces.bytes())
     assert any("changed since it was made" in why for why in certificate.reasons)
     assert not certificate.accepts(("bounded", "open"))
 
@@ -337,9 +339,9 @@ def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
         return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if own else r
 
     data = recorded("free", {"duration_s": 2.0, "rate_hz": 100, "control.law": law})
-    assert found(data).verdict.finding is not StabilityFinding.BROKEN
+    assert certify_bytes(data).verdict.finding is not StabilityFinding.BROKEN
     for change in (scaled, lambda r: r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}):
-        certificate = found(edited(data, record=change))
+        certificate = certify_bytes(edited(data, record=change))
         assert certificate.verdict.finding is StabilityFinding.BROKEN
         assert "the torque of m1 is not that of Eq. (13)" in certificate.verdict.text
         assert not certificate.accepts(("open",))
@@ -347,6 +349,6 @@ def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
 
 def test_sites_that_did_not_react_stay_open() -> None:
     claims = {"driver": "rerun", "rerun_executed": "s"}
-    certificate = found(edited(recorded("free", RUN), session=claims))
+    certificate = certify_bytes(edited(recorded("free", RUN), session=claims))
     assert any("m1 and m2, as recorded, did not react" in why for why in certificate.reasons)
     assert certificate.stability is Stability.OPEN

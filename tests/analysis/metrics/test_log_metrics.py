@@ -23,7 +23,7 @@ from trilat_net.analysis.metrics.log_metrics import (
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
 
-from .written import pair, simulated, under
+from .written import pair, replace_scenario, simulated
 
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
@@ -339,7 +339,7 @@ def test_without_truth_estimates_have_no_error() -> None:
         "sites.s.arm.known": False,
         "sites.s.control.theta_hat0": THETA,
     }
-    measured = compute_log_metrics(under(log, changes))
+    measured = compute_log_metrics(replace_scenario(log, changes))
     assert measured.estimates["s"].theta is None
     assert measured.estimates["s"].last == log["s"].theta_hat[-1].tolist()
     assert measured.sites["s"]["theta_error_last"].why == "theta of the arm is not known"

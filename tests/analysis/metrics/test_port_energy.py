@@ -14,7 +14,7 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.port_energy import held_work, trapezoid_work
 from trilat_net.scenario.arms import build_arm
 
-from .written import pair, simulated, under
+from .written import pair, replace_scenario, simulated
 
 
 def test_work_of_springs_is_exact_path_independent() -> None:
@@ -101,7 +101,7 @@ def test_periods_without_both_records_are_left_out() -> None:
 def test_an_unknown_arm_has_no_mechanical_energy() -> None:
     """The energy through the ports is known all the same; an external arm was given tau."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    outside = under(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
+    outside = replace_scenario(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
     found, before = (compute_log_metrics(one).sites["s"] for one in (outside, log))
     assert found["mechanical_j"].value is None
     assert found["mechanical_j"].why == "theta of the arm is not known"
@@ -111,8 +111,8 @@ def test_an_unknown_arm_has_no_mechanical_energy() -> None:
     assert before["mechanical_j"].value is not None
 
 
-@pytest.mark.parametrize("apart", [1.0, -1.0])
-def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
+@pytest.mark.parametrize("distance", [1.0, -1.0])
+def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
     """int qd K (q_j(t - T) - q_j(t)) dt = -K A_i A_j pi sin(w T) a second at w = 2 pi.
 
     Arms that move against each other are given energy, arms that move together lose it.
@@ -120,7 +120,7 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
     A, w, K, delay_s = 0.2, 2.0 * math.pi, 10.0, 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
-        sign = apart if site == "s" else 1.0
+        sign = distance if site == "s" else 1.0
         wave = {
             "q": [sign * A * math.sin(w * t_s), 0.0],
             "qd": [sign * A * w * math.cos(w * t_s), 0.0],
@@ -131,7 +131,7 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
     found = compute_log_metrics(pair(motion, seconds=seconds)).links["m->s"]
     # until the first sample comes the peer is at its start pose
     begun = 0.5 * w * delay_s / math.pi
-    expected = -apart * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
+    expected = -distance * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
     assert found["delay_j"].value == pytest.approx(expected, rel=2e-3)
 
 

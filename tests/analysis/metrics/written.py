@@ -62,7 +62,7 @@ def simulated(name: str, overrides: Mapping[str, Any] | None = None) -> Log:
     return runs.run(name, overrides).log
 
 
-def under(log: Log, overrides: Mapping[str, Any]) -> Log:
+def replace_scenario(log: Log, overrides: Mapping[str, Any]) -> Log:
     """Returns the records of a log under a different scenario."""
     scenario = parse_scenario(log.scenario_text, "changed", dict(overrides))
     stream = io.BytesIO()

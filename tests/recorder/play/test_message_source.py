@@ -86,7 +86,7 @@ def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionH
     source.close()  # again
 
 
-def taken(source: MessageSource) -> list[MessageBatch]:
+def read_batches(source: MessageSource) -> list[MessageBatch]:
     blocks = []
 
     def over() -> bool:
@@ -101,7 +101,7 @@ def taken(source: MessageSource) -> list[MessageBatch]:
 
 def rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
     for _ in range(count):
-        yield joined(taken(source))
+        yield joined(read_batches(source))
         source.restart()
 
 

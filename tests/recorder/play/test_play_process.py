@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.net.local_bus import LocalNetwork
-from tests.net.parties import told
+from tests.net.parties import answer_info
 from tests.net.waiting import drained
 from trilat_net.app.play.message_source import MessageSource
 from trilat_net.app.play.play_process import (
@@ -100,7 +100,7 @@ class Scribe:
     def __init__(self, hall: Hall, *, stores: bool = True) -> None:
         bus = hall.network.join()
         session = hall.options.session
-        info = told(topics.RECORDER, RECORDER_BOOT)
+        info = answer_info(topics.RECORDER, RECORDER_BOOT)
         bus.respond(topics.key(session, topics.RECORDER, topics.INFO), lambda _: encode(info))
         bus.announce(liveliness_token(session, topics.RECORDER, RECORDER_BOOT))
         publish = bus.publisher(topics.key(session, topics.RECORDER, topics.EVENT))
@@ -224,7 +224,7 @@ def test_joining_recorders_learn_tick_0(log_file: Path) -> None:
     """By the code of the recorder's own way into a session."""
     hall = Hall(log_file)
     bus = hall.network.join()
-    info = told(topics.RECORDER, RECORDER_BOOT)
+    info = answer_info(topics.RECORDER, RECORDER_BOOT)
     epochs: list[Epoch] = []
     begun: list[int] = []
     joining: list[SessionJoin] = []
@@ -292,16 +292,18 @@ def test_existing_sessions_are_refused() -> None:
     network, clock = LocalNetwork(), LookedAt()
     visitor, there = network.join(), network.join()
     there.respond(
-        topics.key("other", "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
+        topics.key("other", "m1", topics.INFO),
+        lambda _: encode(answer_info("m1", RECORDER_BOOT)),
     )
     there.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
     there.respond(
         topics.key(SESSION, "recorder", topics.INFO),
-        lambda _: encode(told("recorder", RECORDER_BOOT)),
+        lambda _: encode(answer_info("recorder", RECORDER_BOOT)),
     )
     refuse_running_session(visitor, clock, SESSION, lambda: False)
     there.respond(
-        topics.key(SESSION, "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
+        topics.key(SESSION, "m1", topics.INFO),
+        lambda _: encode(answer_info("m1", RECORDER_BOOT)),
     )
     with pytest.raises(
         SessionError, match="session 'replay-paper' already exists and is waiting to begin"

@@ -16,24 +16,24 @@ TOPICS = [
 ]
 
 
-def taken(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
+def select_channels(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
     selection = parse_selection(include, exclude, None, None, None, "publish")
     return [topic for topic in TOPICS if selection.accepts(topic, SITES)]
 
 
 def test_default_is_all_messages_of_sites() -> None:
-    assert taken() == TOPICS[:3]
+    assert select_channels() == TOPICS[:3]
 
 
 def test_included_channels_are_played_alone() -> None:
-    assert taken(("/viz/**",)) == TOPICS[5:]
-    assert taken(("**/state", "trilat/*/s/*")) == [TOPICS[0], TOPICS[2]]
-    assert taken(("**",)) == TOPICS
+    assert select_channels(("/viz/**",)) == TOPICS[5:]
+    assert select_channels(("**/state", "trilat/*/s/*")) == [TOPICS[0], TOPICS[2]]
+    assert select_channels(("**",)) == TOPICS
 
 
 def test_exclusion_overrides_inclusion() -> None:
-    assert taken(exclude=("**/link",)) == [TOPICS[0], TOPICS[2]]
-    assert taken(("**",), ("/trilat/**",)) == TOPICS[5:]
+    assert select_channels(exclude=("**/link",)) == [TOPICS[0], TOPICS[2]]
+    assert select_channels(("**",), ("/trilat/**",)) == TOPICS[5:]
 
 
 def test_durations_count_from_start_or_tick_0() -> None:

@@ -17,11 +17,11 @@ ROBOT, TELEOPERATOR = "lerobot_robot_trilat", "lerobot_teleoperator_trilat"
 
 
 def drive(
-    found: dict[str, ModuleType], running: Any, wait_s: Callable[[float], Any], **reach: Any
+    plugins: dict[str, ModuleType], running: Any, wait_s: Callable[[float], Any], **reach: Any
 ) -> dict[str, Any]:
     """Moves both arms through the plugins for two seconds and returns the reported observations."""
-    robot = make_device(found[ROBOT].TrilatRobotConfig(**reach))
-    teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
+    robot = make_device(plugins[ROBOT].TrilatRobotConfig(**reach))
+    teleoperator = make_device(plugins[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
     robot.connect()
     teleoperator.connect()
     first, before = robot.get_observation(), teleoperator.get_teleop_events()

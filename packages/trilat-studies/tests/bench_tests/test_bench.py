@@ -80,7 +80,7 @@ from trilat_net.work.study_folder import encode_csv
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}
 
 
-def asked(**more: Any) -> BenchPlan:
+def plan_small_suite(**more: Any) -> BenchPlan:
     """Returns a request for two cells of two sites, one cell with two seeds."""
     return plan_bench(
         **{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more}
@@ -97,14 +97,16 @@ def files(results: BenchResults) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
-    folder = prepare_bench_folder(asked(), tmp_path_factory.mktemp("suite") / "whole")
+    folder = prepare_bench_folder(
+        plan_small_suite(), tmp_path_factory.mktemp("suite") / "whole"
+    )
     return run_bench(folder, jobs=1)
 
 
 def test_an_interrupted_suite_resumes_to_the_same_bytes(
     whole: BenchResults, tmp_path: Path
 ) -> None:
-    folder, made = prepare_bench_folder(asked(), tmp_path / "parts"), []
+    folder, made = prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), []
 
     def stop(done: int, _total: int) -> None:
         made.append(done)
@@ -113,7 +115,9 @@ def test_an_interrupted_suite_resumes_to_the_same_bytes(
 
     with pytest.raises(KeyboardInterrupt):
         run_bench(folder, jobs=1, progress=stop)
-    again = run_bench(prepare_bench_folder(asked(), tmp_path / "parts"), jobs=1, progress=stop)
+    again = run_bench(
+        prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), jobs=1, progress=stop
+    )
     assert made == [1, 2, 3]
     assert again.runs == whole.runs
     assert files(again) == files(whole)
@@ -124,7 +128,9 @@ def test_the_executor_of_the_cells_changes_no_result(
     whole: BenchResults, tmp_path: Path
 ) -> None:
     with ThreadPoolExecutor(1) as executor:
-        bench = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
+        bench = run_bench(
+            prepare_bench_folder(plan_small_suite(), tmp_path / "elsewhere"), on=executor
+        )
     assert files(bench) == files(whole)
 
 
@@ -172,7 +178,7 @@ def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
 
 def test_stiffness_at_the_hand_is_static() -> None:
     """Two springs and the wall under P+d, nearly at rest 2 s after contact."""
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
         q, torque = rest_in_contact(60.0, settings)
@@ -184,7 +190,7 @@ def test_stiffness_at_the_hand_is_static() -> None:
 
 
 def test_stiffness_is_measured_two_seconds_after_contact() -> None:
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     cell = with_gains(cell, K=60.0, d=6.0)
     built, ends = cell.build(1), []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
@@ -208,7 +214,7 @@ def test_stiffness_is_measured_two_seconds_after_contact() -> None:
 
 def test_free_impedance_is_that_of_coupled_arms() -> None:
     """P+d over 4 ms: D = M s^2 + (d + 0.5) s + K - K e^-sT (M s^2 + d s + K)^-1 K e^-sT."""
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     K, d, s = 60.0, 12.0, 2j * np.pi
     q, _ = rest_in_contact(K, TASKS["contact"].settings)
     cosine = np.cos(q[1])
@@ -238,7 +244,7 @@ def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
 
 
 def test_a_barely_touched_wall_masks_the_numbers() -> None:
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     run = run_bench_task(BenchRunItem(with_gains(cell, K=2.0, d=20.0), 1))
     assert run.wall_n is not None
     assert run.wall_n < LEAST_CONTACT_N
@@ -251,7 +257,7 @@ def test_a_barely_touched_wall_masks_the_numbers() -> None:
 
 
 def test_a_longer_run_stays_unstable(tmp_path: Path) -> None:
-    (cell,) = asked(links=["rtt272"]).cells
+    (cell,) = plan_small_suite(links=["rtt272"]).cells
     plan = BenchPlan("round-trips", [with_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
     (run,) = run_bench(prepare_bench_folder(plan, tmp_path / "suite"), jobs=1).runs
     assert run.stability is Stability.NOT_STABLE
@@ -305,13 +311,15 @@ def test_an_interrupted_confirmation_resumes(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_run, "run_bench_task", run)
-    folder = prepare_bench_folder(asked(), tmp_path / "suite")
+    folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
         run_bench(folder, on=executor, progress=stop)
     assert made.count(0.0) == 3
     before = len(made)
     with ThreadPoolExecutor(1) as executor:
-        results = run_bench(prepare_bench_folder(asked(), tmp_path / "suite"), on=executor)
+        results = run_bench(
+            prepare_bench_folder(plan_small_suite(), tmp_path / "suite"), on=executor
+        )
     assert made[before:] == [60.0, 60.0]
     assert [(one.confirmed, one.length_s) for one in results.runs] == [(True, 60.0)] * 3
 
@@ -320,7 +328,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
     """A run of 20 s of two sites that decays slowly."""
     fit = EnvelopeFit(EnvelopeTrend.HARDLY, -0.02)
     facts = {
-        "scenario": asked(links=["rtt8"]).cells[0].build(1).scenario,
+        "scenario": plan_small_suite(links=["rtt8"]).cells[0].build(1).scenario,
         "records": {},
         "end": RunEnd(EndBehaviour.HARDLY, fit, fit, 0.1, 0.1),
         "twins": TwinGrowth(""),
@@ -333,7 +341,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
 
 
 @pytest.mark.parametrize(
-    ("rate_per_s", "length_s", "words"),
+    ("rate_per_s", "length_s", "phrase"),
     [
         (-0.01, 600.0, ""),  # the root, six time constants of 100 s
         (None, 300.0, ""),  # no roots: the envelope, six of 50 s
@@ -342,7 +350,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
     ],
 )
 def test_run_length_follows_the_slowest_time_constant(
-    rate_per_s: float | None, length_s: float, words: str, monkeypatch: pytest.MonkeyPatch
+    rate_per_s: float | None, length_s: float, phrase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judgement = judged_run(rate_per_s)
     monkeypatch.setattr(
@@ -354,7 +362,7 @@ def test_run_length_follows_the_slowest_time_constant(
     )
     longer = lengthen_run(judgement)
     assert longer.scenario.duration_s == length_s
-    assert words in longer.text
+    assert phrase in longer.text
 
 
 def test_a_decided_run_at_rest_is_not_extended() -> None:
@@ -365,7 +373,7 @@ def test_a_decided_run_at_rest_is_not_extended() -> None:
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:
-    cell = asked(links=["rtt8"]).cells[0]
+    cell = plan_small_suite(links=["rtt8"]).cells[0]
     judged = [
         (Stability.STABLE, Stability.STABLE, False),
         (Stability.NOT_STABLE, Stability.NOT_STABLE, True),
@@ -465,8 +473,8 @@ def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
     return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
 
 
-def place(*errors: float | None) -> BenchCellResult:
-    cell = asked().cells[1]
+def make_cell_result(*errors: float | None) -> BenchCellResult:
+    cell = plan_small_suite().cells[1]
     return BenchCellResult(
         cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
     )
@@ -474,18 +482,20 @@ def place(*errors: float | None) -> BenchCellResult:
 
 def test_intervals_over_twenty_seeds_equal_scipys() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
-    found: Any = place(*errors).compute_mean("error_rad")
+    found: Any = make_cell_result(*errors).compute_mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
     assert (found.mean - found.half, found.mean + found.half) == pytest.approx(
         (low, high), rel=1e-12
     )
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
-    assert place(*errors).interval == pytest.approx((share.low, share.high), rel=1e-12)
-    assert place(*errors[:19]).interval is None
-    assert place(*errors[:19]).compute_mean("error_rad") == pytest.approx(
+    assert make_cell_result(*errors).interval == pytest.approx(
+        (share.low, share.high), rel=1e-12
+    )
+    assert make_cell_result(*errors[:19]).interval is None
+    assert make_cell_result(*errors[:19]).compute_mean("error_rad") == pytest.approx(
         np.mean(errors[:19]), rel=1e-12
     )
-    assert place(0.31, None).compute_mean("error_rad") is None
+    assert make_cell_result(0.31, None).compute_mean("error_rad") is None
 
 
 FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
@@ -640,13 +650,13 @@ def test_gains_come_from_the_next_longer_round_trip() -> None:
 
 
 def test_gains_of_another_law_or_scenario_are_stale() -> None:
-    tuned = asked().cells[0].tuned
+    tuned = plan_small_suite().cells[0].tuned
     other = msgspec.structs.replace(tuned, fingerprint="0" * 16)
     assert find_stale([other]) == [f"p_d (level, {tuned.round_trip_ms} ms)"]
 
 
 @pytest.mark.parametrize(
-    ("more", "words"),
+    ("more", "phrase"),
     [
         ({"study": "smal"}, "no study 'smal' is available; did you mean 'small'"),
         ({"laws": ["p_dd"]}, "no law 'p_dd' is available; did you mean"),
@@ -659,18 +669,20 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
         ),
     ],
 )
-def test_impossible_requests_are_refused(more: dict[str, Any], words: str) -> None:
+def test_impossible_requests_are_refused(more: dict[str, Any], phrase: str) -> None:
     with pytest.raises(UsageError) as refused:
-        asked(**more)
-    assert words in str(refused.value)
+        plan_small_suite(**more)
+    assert phrase in str(refused.value)
 
 
 @pytest.mark.long
 def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path) -> None:
-    first = run_bench(prepare_bench_folder(asked(links=["rtt8"]), tmp_path / "one"), jobs=1)
+    first = run_bench(
+        prepare_bench_folder(plan_small_suite(links=["rtt8"]), tmp_path / "one"), jobs=1
+    )
     made: list[int] = []
     more = run_bench(
-        prepare_bench_folder(asked(), tmp_path / "one"),
+        prepare_bench_folder(plan_small_suite(), tmp_path / "one"),
         jobs=1,
         progress=lambda done, _: made.append(done),
     )
@@ -678,7 +690,7 @@ def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path
     assert more.runs == whole.runs
     assert more.runs[0] == first.runs[0]
     gains = {"K": 20.0, "d": 5.0}
-    cell = asked().cells[0]
+    cell = plan_small_suite().cells[0]
     other = cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
     changed = BenchPlan("round-trips", [other], [])
     assert (
@@ -690,8 +702,8 @@ def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path
     with pytest.raises(
         UsageError, match="results from both cannot be mixed: choose another folder with out"
     ):
-        prepare_bench_folder(asked(), tmp_path / "one")
+        prepare_bench_folder(plan_small_suite(), tmp_path / "one")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()
     with pytest.raises(UsageError, match="is not empty"):
-        prepare_bench_folder(asked(), tmp_path / "full")
+        prepare_bench_folder(plan_small_suite(), tmp_path / "full")

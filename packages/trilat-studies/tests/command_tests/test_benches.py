@@ -58,7 +58,7 @@ def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "facts"),
+    ("arguments", "facts"),
     [
         (("--study", "ful"), ["no study 'ful'", "did you mean 'full'"]),
         (("--law", "adaptiv"), ["no law 'adaptiv'"]),
@@ -68,6 +68,6 @@ def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
     ],
 )
 def test_impossible_requests_are_refused_in_a_line(
-    words: tuple[str, ...], facts: list[str], tmp_path: Path
+    arguments: tuple[str, ...], facts: list[str], tmp_path: Path
 ) -> None:
-    trilat("bench", *words, cwd=tmp_path).refuses(*facts)
+    trilat("bench", *arguments, cwd=tmp_path).refuses(*facts)

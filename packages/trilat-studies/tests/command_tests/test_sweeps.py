@@ -162,7 +162,7 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "problem"),
+    ("arguments", "problem"),
     [
         (("done", "--over", "control.Kd=1,2"), "--over is already set by the sweep"),
         (("--resume", "done", "--seeds", "3"), "--seeds is already set by the sweep"),
@@ -189,6 +189,6 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
     ],
 )
 def test_impossible_requests_are_refused_in_a_sentence(
-    folder: Path, words: tuple[str, ...], problem: str
+    folder: Path, arguments: tuple[str, ...], problem: str
 ) -> None:
-    trilat("sweep", *words, cwd=folder).refuses(problem)
+    trilat("sweep", *arguments, cwd=folder).refuses(problem)

@@ -71,7 +71,7 @@ def test_junit_is_written_for_any_outcome(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ("./missing.toml", "missing.toml"),
         ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
@@ -82,9 +82,9 @@ def test_junit_is_written_for_any_outcome(folder: Path) -> None:
         ("./mute.toml", "[expect]"),
     ],
 )
-def test_bad_input_exits_2_before_any_run(words: tuple[str, ...], folder: Path) -> None:
+def test_bad_input_exits_2_before_any_run(arguments: tuple[str, ...], folder: Path) -> None:
     (folder / "mute.toml").write_text(QUICK.partition("[expect]")[0])
-    trilat("test", *words[:-1], cwd=folder).refuses(words[-1])
+    trilat("test", *arguments[:-1], cwd=folder).refuses(arguments[-1])
 
 
 def test_default_is_every_shipped_scenario_with_expectations() -> None:

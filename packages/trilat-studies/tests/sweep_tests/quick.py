@@ -14,7 +14,7 @@ DELAYS = "link.delay_ms=0:40:20"
 DAMPING = "control.Kd=1:4:1"
 
 
-def asked(folder: Path, *overrides: str, **settings: object) -> SweepPlan:
+def plan_quick_sweep(folder: Path, *overrides: str, **settings: object) -> SweepPlan:
     """Returns a request for a sweep of the quick scenario, as a file."""
     path = folder / "trio.toml"
     if not path.exists():

@@ -14,7 +14,7 @@ from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
 
-from .quick import SHORT, asked
+from .quick import SHORT, plan_quick_sweep
 
 AT_REST_OR_LOST = ("limits.qd_limit_rad_s=6", "link.loss=0.1")
 
@@ -24,7 +24,9 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     """Returns cells that settle, that are extended, and that diverge."""
     path = tmp_path_factory.mktemp("again")
     over = ["control.d=0.1,1,8", "link.delay_ms=0,400"]
-    sweep = asked(path, "control.law=p_d", "control.K=40", *AT_REST_OR_LOST, over=over)
+    sweep = plan_quick_sweep(
+        path, "control.law=p_d", "control.K=40", *AT_REST_OR_LOST, over=over
+    )
     return run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results
 
 

@@ -13,7 +13,7 @@ from trilat_studies.sweep.sweep_cell import apply_diff, diff_lines
 from trilat_studies.sweep.sweep_results import build_sim_command
 from trilat_studies.sweep.sweep_run import CellItem, run_cell
 
-from sweep_tests.quick import Judge, asked
+from sweep_tests.quick import Judge, plan_quick_sweep
 from trilat_net.app.cli.options import load_chosen_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -27,18 +27,18 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
 
 
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
-    plan = asked(tmp_path, "link.loss=0.1", seeds=2)
+    plan = plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=2)
     entry = run_cell(CellItem(plan, plan.cell(5), 2))
     (text,) = judge.texts
     assert apply_diff(entry.scenario, plan.base.text) == text
     assert entry.outcome == judge(text, plan.longest_s)
     assert (entry.cell, entry.seed, entry.random, entry.law) == (5, 2, True, "adaptive")
-    same = asked(tmp_path)
+    same = plan_quick_sweep(tmp_path)
     assert not run_cell(CellItem(same, same.cell(5), 1)).random
 
 
 def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Judge) -> None:
-    plan = asked(
+    plan = plan_quick_sweep(
         tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
     )
     run_cell(CellItem(plan, plan.cell(1), 1))
@@ -54,7 +54,7 @@ def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Jud
 
 @pytest.mark.usefixtures("judge")
 def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
-    plan = asked(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
+    plan = plan_quick_sweep(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
     task = CellItem(plan, plan.cell(3), 1)
     restored_task = pickle.loads(pickle.dumps(task))
     assert run_cell(restored_task) == run_cell(task)
@@ -66,7 +66,7 @@ def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
 
 
 def test_a_cell_without_valid_scenario_is_named(tmp_path: Path) -> None:
-    plan = asked(tmp_path)
+    plan = plan_quick_sweep(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
     with pytest.raises(
         ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"

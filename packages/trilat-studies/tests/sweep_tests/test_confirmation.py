@@ -18,7 +18,7 @@ from trilat_net.errors import UsageError
 from trilat_net.execution import virtual
 from trilat_net.scenario import Scenario, load_scenario
 
-from .maps import KEYS, Row, by_the_line, rows
+from .maps import KEYS, Row, judge_by_condition, rows
 
 BRIEF = {"link.delay_ms": 0.0, "rate_hz": 200, "duration_s": 12.0}
 CALM = load_scenario("p_d_margin", {**BRIEF, "control.d": 4.0})
@@ -135,7 +135,9 @@ def test_cells_are_spread_over_the_edge() -> None:
 def test_undecided_cells_move_the_edge_beyond_them() -> None:
     def band(delay_ms: float, d: float, *_: Any) -> CellClass:
         return (
-            CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
+            CellClass.UNDECIDED
+            if abs(d - 5e-3 * delay_ms) < 0.3
+            else judge_by_condition(delay_ms, d)
         )
 
     cells = choose_cells_near_edges(list(rows(band)), KEYS, 3)

@@ -22,7 +22,7 @@ from trilat_net.errors import UsageError
 from trilat_net.presentation.appearance import make_print_size
 
 from .maps import KEYS, P_D, rows
-from .quick import asked
+from .quick import plan_quick_sweep
 
 DELAYS_MS = (200.0, 250.0)
 DAMPINGS = (0.8, 1.0, 1.2, 1.4)
@@ -113,20 +113,22 @@ def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
 
 
 def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
-    verdicts, twins = (asked(tmp_path, judge=judge) for judge in ("verdict", "twins"))
+    verdicts, twins = (
+        plan_quick_sweep(tmp_path, judge=judge) for judge in ("verdict", "twins")
+    )
     assert "judge" not in verdicts.facts()
     assert plan_from_json(verdicts.facts()).judge == "verdict"
     prepare_sweep_folder(verdicts, tmp_path / "o")
-    longest = asked(tmp_path, judge="twins", longest_s=verdicts.longest_s)
+    longest = plan_quick_sweep(tmp_path, judge="twins", longest_s=verdicts.longest_s)
     with pytest.raises(UsageError, match="another judge: there verdict, here twins"):
         prepare_sweep_folder(longest, tmp_path / "o")
     assert (twins.longest_s, verdicts.longest_s) == (0.5, 4.0)
     with pytest.raises(UsageError, match="verdict, twins, not 'luck'"):
-        asked(tmp_path, judge="luck")
+        plan_quick_sweep(tmp_path, judge="luck")
 
 
 def test_the_command_of_a_map_names_its_judge(tmp_path: Path) -> None:
-    assert build_sweep_command(asked(tmp_path, judge="twins"), "--map").endswith(
+    assert build_sweep_command(plan_quick_sweep(tmp_path, judge="twins"), "--map").endswith(
         " --judge twins --map"
     )
-    assert "--judge" not in build_sweep_command(asked(tmp_path))
+    assert "--judge" not in build_sweep_command(plan_quick_sweep(tmp_path))

@@ -36,7 +36,7 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def judged(scenario: Scenario, longest_s: float = 0.0) -> CellResult:
+def judge_result(scenario: Scenario, longest_s: float = 0.0) -> CellResult:
     return classify_cell(scenario.text, longest_s)
 
 
@@ -48,7 +48,7 @@ def test_verdict_and_numbers_are_those_of_a_log(run: str) -> None:
     virtual.write_virtual_log(scenario, stream)
     stream.seek(0)
     log = open_log(stream)
-    found, certificate = judged(scenario), certify_run(log)
+    found, certificate = judge_result(scenario), certify_run(log)
     expected = certificate.end
     assert found.motion is expected.behaviour
     assert found.verdict is classify_decision(certificate.stability, expected.behaviour)
@@ -76,7 +76,7 @@ def test_scenarios_have_their_published_behaviour(
     name: str, changes: dict[str, Any], verdict: CellClass
 ) -> None:
     """The figures of these scenarios, from an independent implementation, stand in their texts."""
-    assert judged(load_scenario(name, changes)).verdict is verdict
+    assert judge_result(load_scenario(name, changes)).verdict is verdict
 
 
 @pytest.mark.long
@@ -87,7 +87,7 @@ def test_python_law_is_judged_like_kernel_law() -> None:
     """
     short = {"duration_s": 2.0, "link.delay_ms": 5.0}
     theirs = load_scenario("free", {**short, "control.law": "tests.laws:Adaptive"})
-    assert judged(theirs) == judged(load_scenario("free", short))
+    assert judge_result(theirs) == judge_result(load_scenario("free", short))
 
 
 @pytest.mark.long
@@ -95,12 +95,12 @@ def test_an_undecided_run_continues_as_longer_run() -> None:
     """A growth of 0.01/s is invisible in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}
     scenario = load_scenario("p_d_margin", changes)
-    assert not is_conclusive(judged(scenario))
-    found = judged(scenario, longest_s=256.0)
+    assert not is_conclusive(judge_result(scenario))
+    found = judge_result(scenario, longest_s=256.0)
     assert found.verdict is CellClass.DIVERGED
     assert found.extended > 0
     assert found.ran_s == 4.0 * 2**found.extended
-    whole = judged(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
+    whole = judge_result(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
     totals = FusedRun(scenario)  # those of the scenario's own duration
     totals.advance_to(4.0)
     assert (
@@ -111,7 +111,7 @@ def test_an_undecided_run_continues_as_longer_run() -> None:
 
 def test_slow_trends_under_random_links_decide_nothing() -> None:
     """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
-    found = judged(
+    found = judge_result(
         load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}),
         longest_s=160.0,
     )
@@ -121,7 +121,7 @@ def test_slow_trends_under_random_links_decide_nothing() -> None:
 
 def test_no_run_is_extended_beyond_its_limit() -> None:
     scenario = load_scenario("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
-    found = judged(scenario, longest_s=10.0)
+    found = judge_result(scenario, longest_s=10.0)
     assert (found.ran_s, found.extended) == (10.0, 2)
     assert not is_conclusive(found)
 
@@ -133,7 +133,7 @@ def test_few_per_cent_beside_edge_verdicts_are_right(d: float) -> None:
     Runs of 160 s decide where runs of 20 s cannot.
     """
     scenario = load_scenario("p_d_margin", {"control.d": d, "duration_s": 20.0})
-    found = judged(scenario, longest_s=160.0)
+    found = judge_result(scenario, longest_s=160.0)
     assert found.extended > 0
     assert found.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
 
@@ -147,7 +147,7 @@ def test_roots_decide_for_arms_that_hardly_move(d: float, verdict: CellClass) ->
         f"sites.{name}.q0_rad": [-0.6, 1.8 + off]
         for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
     }
-    found = judged(
+    found = judge_result(
         load_scenario(
             "p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}
         )
@@ -156,7 +156,7 @@ def test_roots_decide_for_arms_that_hardly_move(d: float, verdict: CellClass) ->
 
 
 def test_a_run_that_diverges_says_when() -> None:
-    found = judged(load_scenario(*RUNS["diverged"]), longest_s=100.0)
+    found = judge_result(load_scenario(*RUNS["diverged"]), longest_s=100.0)
     assert found.motion is EndBehaviour.DIVERGED
     assert found.diverged_s == found.ran_s
     assert found.extended == 0

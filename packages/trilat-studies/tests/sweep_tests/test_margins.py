@@ -30,7 +30,7 @@ from trilat_net.scenario import parse_scenario
 WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
 
 
-def asked(*over: str, **settings: object) -> SweepPlan:
+def plan_margin_sweep(*over: str, **settings: object) -> SweepPlan:
     axes = over or ("link.delay_ms=100,200",)
     return plan_sweep("p_d_margin", over=[*axes, format_range_axis(WITHIN)], **settings)  # type: ignore[arg-type]
 
@@ -58,7 +58,7 @@ def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("by_the_line")
 def test_a_place_has_its_edge_beside_theory() -> None:
-    (one,) = search_margins(asked("link.delay_ms=200"), WITHIN, 1)
+    (one,) = search_margins(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1)
     assert one.cell.values == (200.0,)
     (span,) = one.margin.spans
     assert span.low <= 1.0 <= span.high
@@ -69,7 +69,7 @@ def test_a_place_has_its_edge_beside_theory() -> None:
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
 def test_seeds_are_places_where_links_are_random() -> None:
-    lossy = search_margins(asked("link.loss=0,0.1", seeds=2), WITHIN, 1)
+    lossy = search_margins(plan_margin_sweep("link.loss=0,0.1", seeds=2), WITHIN, 1)
     assert [(one.cell.values, one.seed) for one in lossy] == [
         ((0.0,), 1),
         ((0.1,), 1),
@@ -99,8 +99,8 @@ def test_whole_number_keys_are_searched_in_integers() -> None:
     assert [margin.margin.stable for margin in search_margins(plan, within, 1)] == [True, True]
 
 
-def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
-    cell = asked().cell(0)
+def make_point_margin(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
+    cell = plan_margin_sweep().cell(0)
     return GridPointMargin(
         cell._replace(values=(100.0,)), 1, KeyMargin(spans, stable, 0, 12), (0.5, 2.0), "", 0.51
     )
@@ -108,8 +108,13 @@ def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
 
 def test_table_shows_edges_islands_and_missing_edges() -> None:
     edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
-    every = [found(*edges), found(stable=True), found(stable=False), found()]
-    grid = SweepMargins(asked(), WITHIN, every).table()
+    every = [
+        make_point_margin(*edges),
+        make_point_margin(stable=True),
+        make_point_margin(stable=False),
+        make_point_margin(),
+    ]
+    grid = SweepMargins(plan_margin_sweep(), WITHIN, every).table()
     edge = grid.headers.index("edge of d (N m s/rad)")
     assert [row[edge] for row in grid.rows] == [
         "0.49 to 0.492",
@@ -123,12 +128,17 @@ def test_table_shows_edges_islands_and_missing_edges() -> None:
     assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
     assert (
-        "not monotone at 1 of 2 grid points" in SweepMargins(asked(), WITHIN, every[:2]).page()
+        "not monotone at 1 of 2 grid points"
+        in SweepMargins(plan_margin_sweep(), WITHIN, every[:2]).page()
     )
 
 
 def test_the_facts_are_json_and_name_the_command() -> None:
-    margins = SweepMargins(asked(), WITHIN, [found(StabilityEdge(0.49, 0.492, False, True))])
+    margins = SweepMargins(
+        plan_margin_sweep(),
+        WITHIN,
+        [make_point_margin(StabilityEdge(0.49, 0.492, False, True))],
+    )
     facts = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
     assert facts["command"] == margins.command
     assert facts["command"].endswith(

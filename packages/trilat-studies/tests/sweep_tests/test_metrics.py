@@ -16,23 +16,25 @@ KEYS = ["settle_s", "spread_rms_rad", "peak_tau_nm"]
 AXIS = {"link.delay_ms": [20, 200]}
 
 
-def swept(folder: Path, **more: object) -> SweepResults:
+def run_metric_sweep(folder: Path, **more: object) -> SweepResults:
     return trilat_net.sweep(
         "two_sites", AXIS, ["duration_s=0.5"], metrics=KEYS, out=folder, jobs=1, **more
     )
 
 
-def of_run(log: Log, key: str) -> float | None:
+def find_log_metric(log: Log, key: str) -> float | None:
     """Returns the metrics that `compare` shows of a log."""
     return trilat_net.compare(log, log).metrics.row(key).values[0]
 
 
 def test_metrics_of_a_cell_equal_its_logs(tmp_path: Path) -> None:
-    found = swept(tmp_path / "o", duration_s=0.5, longest_s=0.5)
+    found = run_metric_sweep(tmp_path / "o", duration_s=0.5, longest_s=0.5)
     for row in found.rows:
         delay = row["link.delay_ms"]
         log = trilat_net.simulate("two_sites", {"duration_s": 0.5, "link.delay_ms": delay})
-        assert {key: row[key] for key in KEYS} == {key: of_run(log, key) for key in KEYS}
+        assert {key: row[key] for key in KEYS} == {
+            key: find_log_metric(log, key) for key in KEYS
+        }
 
 
 def test_every_row_holds_metrics_under_their_keys(tmp_path: Path) -> None:
@@ -46,14 +48,14 @@ def test_every_row_holds_metrics_under_their_keys(tmp_path: Path) -> None:
     ).rows
     log = trilat_net.simulate("contact", {"duration_s": 12, "link.delay_ms": 20})
     for key in ("rms_error_rad", "walls_j", "force_peak_n"):
-        assert row[key] == pytest.approx(of_run(log, key), rel=1e-9)
+        assert row[key] == pytest.approx(find_log_metric(log, key), rel=1e-9)
     assert row["force_peak_n"] > 0.1
 
 
 def test_a_resumed_sweep_keeps_its_metrics(tmp_path: Path) -> None:
-    found = swept(tmp_path / "o")
+    found = run_metric_sweep(tmp_path / "o")
     assert read_results(tmp_path / "o").to_rows() == found.to_rows()
-    assert swept(tmp_path / "o").to_rows() == found.to_rows()
+    assert run_metric_sweep(tmp_path / "o").to_rows() == found.to_rows()
     with pytest.raises(UsageError, match=r"other metrics: there settle_s, .*, here none"):
         trilat_net.sweep("two_sites", AXIS, ["duration_s=0.5"], out=tmp_path / "o", jobs=1)
 

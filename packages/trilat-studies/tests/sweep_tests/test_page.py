@@ -25,7 +25,7 @@ from trilat_studies.sweep.sweep_plan import plan_sweep
 
 from trilat_net.presentation.appearance import make_print_size
 
-from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
+from .maps import DAMPINGS, DELAYS_MS, judge_by_condition, make_plane, rows
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
 EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
@@ -36,7 +36,7 @@ HALF = MapLine(
 
 @pytest.fixture
 def chart() -> StabilityMap:
-    plane = drawn(link__playout_ms=(0.0, 400.0))
+    plane = make_plane(link__playout_ms=(0.0, 400.0))
     return StabilityMap(
         plane, ((EXACT, HALF), (EXACT,)), ("a remark",), ("trilat sweep a", "trilat map"), "P+d"
     )
@@ -69,12 +69,12 @@ def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
 
 
 def test_counts_are_of_all_runs() -> None:
-    plane = drawn(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
+    plane = make_plane(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
     assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
 
 
 def test_an_edge_stands_beside_each_lines_difference() -> None:
-    plane = drawn()
+    plane = make_plane()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
     heads = [
         "delay (ms)",
@@ -97,7 +97,7 @@ def test_an_edge_stands_beside_each_lines_difference() -> None:
 
 
 def test_a_missing_line_has_no_difference() -> None:
-    plane = drawn()
+    plane = make_plane()
     table = tabulate_edges(
         plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
     )
@@ -105,7 +105,7 @@ def test_a_missing_line_has_no_difference() -> None:
 
 
 def test_a_map_without_an_edge_has_no_table() -> None:
-    plane = drawn(lambda *_, **__: CellClass.CONVERGED)
+    plane = make_plane(lambda *_, **__: CellClass.CONVERGED)
     assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
 
 
@@ -125,12 +125,12 @@ def meshes(made: Figure) -> list[QuadMesh]:
     ]
 
 
-def every(*place: Any) -> CellClass:
-    return CELL_CLASSES[(DELAYS_MS.index(place[0]) + DAMPINGS.index(place[1])) % 4]
+def every(*point: Any) -> CellClass:
+    return CELL_CLASSES[(DELAYS_MS.index(point[0]) + DAMPINGS.index(point[1])) % 4]
 
 
 def test_every_place_has_the_colour_of_its_verdict() -> None:
-    made = figure(drawn(every))
+    made = figure(make_plane(every))
     made.canvas.draw()
     (mesh,) = meshes(made)[:1]
     colours = mesh.get_facecolors().reshape(len(DAMPINGS), len(DELAYS_MS), 4)
@@ -140,7 +140,7 @@ def test_every_place_has_the_colour_of_its_verdict() -> None:
 
 
 def test_a_place_reaches_half_way_to_the_next() -> None:
-    (mesh,) = meshes(figure(drawn()))[:1]
+    (mesh,) = meshes(figure(make_plane()))[:1]
     corners = mesh.get_coordinates()
     assert np.allclose(corners[0, :, 0], [0, 50, 150, 250, 350, 450])
     assert np.allclose(corners[:, 0, 1], [0, 0.45, 0.95, 1.45, 1.95, 2.45])
@@ -159,7 +159,7 @@ def test_classes_differ_in_lightness() -> None:
 
 
 def test_lines_are_drawn_where_they_are_and_named() -> None:
-    made = figure(drawn(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
+    made = figure(make_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
     first, second = (
         collection
         for collection in made.axes[0].collections
@@ -176,12 +176,12 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
 
 
 def test_the_legend_has_only_occurring_classes() -> None:
-    (legend,) = figure(drawn(lambda *_, **__: CellClass.UNDECIDED)).legends
+    (legend,) = figure(make_plane(lambda *_, **__: CellClass.UNDECIDED)).legends
     assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
 
 
 def test_several_runs_show_their_share_with_a_scale() -> None:
-    plane = drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4)
+    plane = make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4)
     made = figure(plane, 7.0)
     share = meshes(made)[0].get_array()
     assert share is not None
@@ -196,7 +196,7 @@ def test_several_runs_show_their_share_with_a_scale() -> None:
 
 @pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
 def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) -> None:
-    plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
+    plane = make_plane(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
     made = figure(plane, width_in, (LINE,))
     assert made.get_figwidth() == width_in
     assert [axes.get_title() for axes in made.axes if axes.collections] == [
@@ -208,7 +208,7 @@ def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) ->
 
 def test_settings_of_matplotlib_stay_unchanged() -> None:
     before = dict(mpl.rcParams)
-    figure(drawn())
+    figure(make_plane())
     assert dict(mpl.rcParams) == before
 
 
@@ -224,7 +224,7 @@ def test_a_place_without_run_is_no_verdict() -> None:
 
 
 def test_uneven_values_are_named_one_by_one() -> None:
-    plane = drawn()
+    plane = make_plane()
     uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
     made = figure(uneven)
     made.canvas.draw()
@@ -243,7 +243,7 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 @pytest.mark.parametrize("panels", [(0.0,), (0.0, 400.0)])
 @pytest.mark.parametrize("width_in", [3.5, 7.0])
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
-    plane = drawn(link__playout_ms=panels)
+    plane = make_plane(link__playout_ms=panels)
     figure = draw_stability_map(
         plane, [()] * len(plane.panels), make_print_size(width_in), FIXED
     )

@@ -20,7 +20,7 @@ from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 
-from .quick import SHORT, asked
+from .quick import SHORT, plan_quick_sweep
 
 
 def refused(source: str, *overrides: str, **settings: object) -> str:
@@ -34,7 +34,9 @@ def refused(source: str, *overrides: str, **settings: object) -> str:
 def cube(tmp_path_factory: pytest.TempPathFactory) -> SweepPlan:
     """Returns a request with two laws and three axes."""
     over = ["link.delay_ms=0:40:20", "sites.s.q0_rad.0=0.1,0.2", "link.order=newest,in_order"]
-    return asked(tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"])
+    return plan_quick_sweep(
+        tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"]
+    )
 
 
 @given(
@@ -126,17 +128,17 @@ def test_another_law_replaces_every_sites_law_and_gains() -> None:
 
 
 def test_seeds_count_from_the_scenarios_or_are_named(tmp_path: Path) -> None:
-    assert asked(tmp_path).seeds == (1,)
-    assert asked(tmp_path, "seed=5", seeds=3).seeds == (5, 6, 7)
-    assert asked(tmp_path, seeds=[4, 2, 4]).seeds == (4, 2)
+    assert plan_quick_sweep(tmp_path).seeds == (1,)
+    assert plan_quick_sweep(tmp_path, "seed=5", seeds=3).seeds == (5, 6, 7)
+    assert plan_quick_sweep(tmp_path, seeds=[4, 2, 4]).seeds == (4, 2)
     assert "1 to 100000" in refused("paper", seeds=0)
     assert "1 to 100000" in refused("paper", seeds=100_001)
     assert "from 0 to 2^63 - 1, not -1" in refused("paper", seeds=[-1])
 
 
 def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
-    assert asked(tmp_path).longest_s == 4.0
-    assert asked(tmp_path, longest_s=0.5).longest_s == 0.5
+    assert plan_quick_sweep(tmp_path).longest_s == 4.0
+    assert plan_quick_sweep(tmp_path, longest_s=0.5).longest_s == 0.5
     assert plan_sweep("paper", ["duration_s=80000"]).longest_s == 86_400.0
     for longest_s in (0.4, 1e6, float("nan")):
         assert "from 0.5 s to 86400 s" in refused(
@@ -145,7 +147,7 @@ def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("over", "words"),
+    ("over", "arguments"),
     [
         (
             ["link.delay=0:1:1"],
@@ -163,10 +165,10 @@ def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_axes_are_refused_before_any_run(
-    over: list[str], words: tuple[str, ...]
+    over: list[str], arguments: tuple[str, ...]
 ) -> None:
     problem = refused("p_d_margin", over=over)
-    for word in words:
+    for word in arguments:
         assert word in problem
 
 
@@ -188,7 +190,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("laws", "words"),
+    ("laws", "arguments"),
     [
         (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
         (
@@ -198,9 +200,11 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
         (["p_d", "p_f"], ("with law p_f", "two sites")),
     ],
 )
-def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str, ...]) -> None:
+def test_a_law_that_cannot_be_swept_is_refused(
+    laws: list[str], arguments: tuple[str, ...]
+) -> None:
     problem = refused("p_d_margin", laws=laws)
-    for word in words:
+    for word in arguments:
         assert word in problem
 
 
@@ -274,7 +278,7 @@ def test_huge_ranges_take_no_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "arguments"),
     [
         ("link.delay_ms", ("KEY=VALUES", "'link.delay_ms'")),
         ("=1,2", ("KEY=VALUES",)),
@@ -300,9 +304,11 @@ def test_huge_ranges_take_no_memory() -> None:
         ("duration_s=1,2", ("longest_s",)),
     ],
 )
-def test_invalid_axes_beside_valid_ones_are_refused(text: str, words: tuple[str, ...]) -> None:
+def test_invalid_axes_beside_valid_ones_are_refused(
+    text: str, arguments: tuple[str, ...]
+) -> None:
     problem = axis_refused(text)
-    for word in words:
+    for word in arguments:
         assert word in problem
 
 

@@ -20,7 +20,7 @@ from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.scenario_reader import list_shipped
 
-from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
+from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, judge_by_condition, make_plane, rows
 
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
@@ -44,17 +44,17 @@ def test_the_share_is_of_decided_runs() -> None:
         CellClass.UNDECIDED,
         CellClass.CONVERGED,
     )
-    found = drawn(lambda *place: verdicts[place[-1] - 1], seeds=4)
+    found = make_plane(lambda *place: verdicts[place[-1] - 1], seeds=4)
     assert np.allclose(found.panels[0].share, 2.0 / 3.0)
     assert found.seeds == 4
 
 
 def test_undecided_places_have_no_share() -> None:
-    assert np.isnan(drawn(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
+    assert np.isnan(make_plane(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
 
 
 def test_words_and_further_axes_make_panels() -> None:
-    found = drawn(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
+    found = make_plane(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
     assert [panel.title for panel in found.panels] == [
         "newest, playout 0 ms",
         "newest, playout 400 ms",
@@ -83,7 +83,7 @@ def test_a_single_axis_is_a_strip() -> None:
 
 
 def test_whole_numbers_stay_whole() -> None:
-    assert all(isinstance(value, int) for value in drawn().x.values)
+    assert all(isinstance(value, int) for value in make_plane().x.values)
 
 
 @pytest.mark.parametrize(
@@ -101,20 +101,20 @@ def test_no_runs_numbers_or_panels_are_refused() -> None:
     with pytest.raises(UsageError, match=r"needs a numeric axis, .* not numbers: link\.order"):
         build_plane(list(rows(link__order=("newest", "in_order"))), ["link.order"], P_D)
     with pytest.raises(UsageError, match=r"at most 12 panels, but rate_hz would give 13"):
-        drawn(rate_hz=tuple(range(13)))
+        make_plane(rate_hz=tuple(range(13)))
 
 
 YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 
-def up(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
+def list_column_edges(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
     """Returns the edges of the first column of a map whose columns are alike."""
-    found = drawn(lambda _, d, *__: column[DAMPINGS.index(d)])
+    found = make_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
     return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]
 
 
 def test_the_condition_lies_in_its_own_edges() -> None:
-    found = drawn()
+    found = make_plane()
     measured = find_map_edges(found, found.panels[0])
     assert [x for x, _ in measured] == [100, 200, 300, 400]
     for x, edge in measured:
@@ -125,7 +125,7 @@ def test_the_condition_lies_in_its_own_edges() -> None:
 @pytest.mark.parametrize("column", list(itertools.product((YES, NO, UNKNOWN), repeat=5))[::7])
 def test_edges_separate_all_decided_places(column: tuple[CellClass, ...]) -> None:
     """From below, the side changes at every edge and nowhere else."""
-    found = up(column)
+    found = list_column_edges(column)
     side = [verdict.stable for verdict in column]
     decided = [(d, one) for d, one in zip(DAMPINGS, side, strict=True) if one is not None]
     changes = [
@@ -137,15 +137,21 @@ def test_edges_separate_all_decided_places(column: tuple[CellClass, ...]) -> Non
 
 
 def test_undecided_places_widen_an_edge() -> None:
-    (edge,) = up((NO, UNKNOWN, UNKNOWN, YES, YES))
+    (edge,) = list_column_edges((NO, UNKNOWN, UNKNOWN, YES, YES))
     assert (edge.low, edge.high, edge.middle) == (0.2, 1.7, pytest.approx(0.95))
 
 
 def test_majorities_of_runs_decide_and_draws_do_not() -> None:
     """Per place seeds 1 and 2 follow the line, and seed 3 contradicts: a majority of two of three."""
-    three = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 3 else YES, seeds=3)
-    assert find_map_edges(three, three.panels[0]) == find_map_edges(drawn(), drawn().panels[0])
-    draw = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 2 or y > 1.0 else YES, seeds=2)
+    three = make_plane(
+        lambda x, y, seed: judge_by_condition(x, y) if seed < 3 else YES, seeds=3
+    )
+    assert find_map_edges(three, three.panels[0]) == find_map_edges(
+        make_plane(), make_plane().panels[0]
+    )
+    draw = make_plane(
+        lambda x, y, seed: judge_by_condition(x, y) if seed < 2 or y > 1.0 else YES, seeds=2
+    )
     assert all(
         edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0])
     )

@@ -21,7 +21,7 @@ from trilat_studies.sweep.sweep_run import (
 
 from trilat_net.errors import ScenarioError, UsageError
 
-from .quick import DELAYS, Judge, asked
+from .quick import DELAYS, Judge, plan_quick_sweep
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
 @pytest.mark.long
 def test_the_number_of_processes_changes_no_byte(tmp_path: Path) -> None:
     """The judge of the package, in this process and in two others."""
-    sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
+    sweep = plan_quick_sweep(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
     alone, others = (
         run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2)
     )
@@ -50,7 +50,7 @@ class _StopError(Exception):
 
 
 def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> None:
-    sweep = asked(tmp_path, "link.loss=0.2", seeds=2)
+    sweep = plan_quick_sweep(tmp_path, "link.loss=0.2", seeds=2)
     run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1)
     whole = (tmp_path / "whole" / RESULTS_FILE).read_bytes()
     texts = judge.texts.copy()
@@ -77,7 +77,7 @@ def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> Non
 
 def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> None:
     told: list[tuple[int, int]] = []
-    sweep = asked(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
+    sweep = plan_quick_sweep(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
     rows = run_sweep(
         prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: told.append(one)
     ).results.rows
@@ -89,7 +89,7 @@ def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> Non
 
 
 def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> None:
-    sweep = asked(tmp_path)
+    sweep = plan_quick_sweep(tmp_path)
     expected = estimate_sweep(sweep, jobs=1)
     assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
     assert (expected.runs, expected.seconds > 0.0) == (12, True)
@@ -101,8 +101,11 @@ def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> N
 
 
 def test_an_estimate_counts_seeds_of_random_links(tmp_path: Path, judge: Judge) -> None:
-    assert estimate_sweep(asked(tmp_path, seeds=10), jobs=1).runs == 12
-    assert estimate_sweep(asked(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs == 120
+    assert estimate_sweep(plan_quick_sweep(tmp_path, seeds=10), jobs=1).runs == 12
+    assert (
+        estimate_sweep(plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs
+        == 120
+    )
     assert judge.texts
 
 
@@ -130,7 +133,9 @@ def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
 
 def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
     """The ends of both axes are valid alone and together; one pair between them is not."""
-    sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
+    sweep = plan_quick_sweep(
+        tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"]
+    )
     folder = prepare_sweep_folder(sweep, tmp_path / "o")
     with pytest.raises(
         ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"
@@ -142,7 +147,7 @@ def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
 
 
 def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
-    sweep = asked(
+    sweep = plan_quick_sweep(
         tmp_path,
         over=["control.Kd=0.2:3:0.1", DELAYS],
         laws=["pd_d", "adaptive"],
@@ -161,7 +166,7 @@ def test_a_summary_counts_every_run_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    sweep = asked(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
+    sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
     results = run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
     first, *others = summarize_sweep(results)
     assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")

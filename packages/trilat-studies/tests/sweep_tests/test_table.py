@@ -25,25 +25,31 @@ from trilat_studies.sweep.sweep_results import (
 from trilat_net.errors import UsageError
 from trilat_net.work.intervals import wilson_interval
 
-from .quick import DELAYS, Judge, asked, outcome_of
+from .quick import DELAYS, Judge, outcome_of, plan_quick_sweep
 
 ORDERS = "link.order=newest,in_order"
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults, Judge]:
+def finished_sweep(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, SweepResults, Judge]:
     """A sweep of numbers and words, two laws, and two seeds where links are random: its folder,
     and its judge.
     """
     path = tmp_path_factory.mktemp("swept")
-    sweep = asked(path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2)
+    sweep = plan_quick_sweep(
+        path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2
+    )
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(sweep_cell, "classify_cell", judge := Judge())
         return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
 
 
-def test_the_read_runs_are_the_written_ones(swept: tuple[Path, SweepResults, Judge]) -> None:
-    path, results, judge = swept
+def test_the_read_runs_are_the_written_ones(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, judge = finished_sweep
     again = read_results(path)
     assert list(again.rows) == list(results.rows)
     assert again.plan.facts() == results.plan.facts()
@@ -57,9 +63,9 @@ def test_the_read_runs_are_the_written_ones(swept: tuple[Path, SweepResults, Jud
 
 
 def test_rows_are_ordered_by_cells_and_seeds(
-    swept: tuple[Path, SweepResults, Judge],
+    finished_sweep: tuple[Path, SweepResults, Judge],
 ) -> None:
-    _, results, _ = swept
+    _, results, _ = finished_sweep
     assert [(row["cell"], row["seed"]) for row in results.rows] == [
         (cell, seed) for cell in range(8) for seed in ((1, 2) if cell % 4 >= 2 else (1,))
     ]
@@ -72,9 +78,9 @@ def test_rows_are_ordered_by_cells_and_seeds(
 
 
 def test_the_order_of_finished_runs_changes_no_byte(
-    swept: tuple[Path, SweepResults, Judge],
+    finished_sweep: tuple[Path, SweepResults, Judge],
 ) -> None:
-    path, results, _ = swept
+    path, results, _ = finished_sweep
     with prepare_sweep_folder(results.plan, path).journal() as journal:
         entries = list(journal.done.values())
     for order in (entries, entries[::-1]):
@@ -82,8 +88,10 @@ def test_the_order_of_finished_runs_changes_no_byte(
         assert table.encode() == (path / "results.csv").read_bytes()
 
 
-def test_csv_readers_find_every_number(swept: tuple[Path, SweepResults, Judge]) -> None:
-    path, results, _ = swept
+def test_csv_readers_find_every_number(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, _ = finished_sweep
     with (path / "results.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     for line, row in zip(lines, results.rows, strict=True):
@@ -98,9 +106,11 @@ def test_csv_readers_find_every_number(swept: tuple[Path, SweepResults, Judge]) 
                 assert line[name] == str(value)
 
 
-def test_pandas_reads_the_types_of_columns(swept: tuple[Path, SweepResults, Judge]) -> None:
+def test_pandas_reads_the_types_of_columns(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
     pandas = pytest.importorskip("pandas")
-    path, results, _ = swept
+    path, results, _ = finished_sweep
     frame = pandas.read_csv(path / "results.csv")
     kinds = [str(frame.dtypes[name]) for name in ("link.loss", "cell", "random")]
     assert kinds == ["float64", "int64", "bool"]
@@ -108,8 +118,10 @@ def test_pandas_reads_the_types_of_columns(swept: tuple[Path, SweepResults, Judg
     assert list(frame["peak_error_rad"]) == pytest.approx(peaks_rad, rel=1e-15)
 
 
-def test_the_request_stands_beside_the_table(swept: tuple[Path, SweepResults, Judge]) -> None:
-    path, results, _ = swept
+def test_the_request_stands_beside_the_table(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, _ = finished_sweep
     facts = json.loads((path / "plan.json").read_text())
     assert facts["scenario_sha256"] == results.plan.base.sha256
     assert facts["text"] == results.plan.written.text
@@ -122,7 +134,7 @@ def test_a_sweep_needs_no_optional_package(
     for name in ("pandas", "polars", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    plan = asked(tmp_path, over=[DELAYS], seeds=2)
+    plan = plan_quick_sweep(tmp_path, over=[DELAYS], seeds=2)
     run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1)
     assert len(read_results(tmp_path / "o").rows) == 3
 
@@ -131,7 +143,7 @@ def test_a_very_long_scenario_is_read_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    plan = asked(tmp_path, over=[DELAYS])
+    plan = plan_quick_sweep(tmp_path, over=[DELAYS])
     rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
     rows[1] = {**rows[1], "scenario": '# "letters", and\r\n' + "x" * 300_000}
     (tmp_path / "o" / "results.csv").write_text(encode_results(plan, rows), newline="")
@@ -168,7 +180,7 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
 
 
 def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
-    sweep = asked(tmp_path, over=[DELAYS])
+    sweep = plan_quick_sweep(tmp_path, over=[DELAYS])
     outcomes = [outcome_of(str(n)) for n in range(100)]
     for outcome in outcomes:
         lasts_s = reproduction_duration_s(sweep, outcome)
@@ -179,13 +191,13 @@ def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    def refused(path: Path, *words: str) -> None:
+    def refused(path: Path, *arguments: str) -> None:
         with pytest.raises(UsageError) as error:
             read_results(path)
-        for word in (str(path), *words):
+        for word in (str(path), *arguments):
             assert word in str(error.value)
 
-    begun = prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
+    begun = prepare_sweep_folder(plan_quick_sweep(tmp_path), tmp_path / "o").path
     refused(begun, "no results", f"trilat sweep --resume {begun}")
     refused(tmp_path / "none.csv", "no results")
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
@@ -208,7 +220,7 @@ def test_a_damaged_table_is_refused(
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     folder = run_sweep(
-        prepare_sweep_folder(asked(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
+        prepare_sweep_folder(plan_quick_sweep(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
     ).folder.path
     table = folder / "results.csv"
     table.write_text(damage(table.read_text()))
@@ -220,7 +232,7 @@ def test_a_damaged_table_is_refused(
 @pytest.fixture
 def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    sweep = asked(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
+    sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
     return collect_grid_points(
         run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
     )

@@ -39,10 +39,10 @@ def scenario(**changes: Any) -> Scenario:
     return load_scenario("free", {**SHORT, **changes})
 
 
-def agree(one: RunMetrics, other: RunMetrics) -> None:
+def agree(metrics: RunMetrics, other: RunMetrics) -> None:
     """Asserts that figures are equal but for the last bits of means."""
     for field in RunMetrics.__struct_fields__:
-        a, b = getattr(one, field), getattr(other, field)
+        a, b = getattr(metrics, field), getattr(other, field)
         if field == "rms_error_rad":
             assert a == pytest.approx(b, rel=1e-12)
         elif field == "ages":

@@ -206,7 +206,7 @@ s = { m = 1.0 }
 """
 
 
-def held(three: bool, d: float, stable: bool, **link: object) -> bool:
+def is_stable(three: bool, d: float, stable: bool, **link: object) -> bool:
     """True if `stable` holds for 40 s of free motion at 200 Hz, over links of 200 ms unless given."""
     changes = {
         "rate_hz": 200,
@@ -231,15 +231,15 @@ def held(three: bool, d: float, stable: bool, **link: object) -> bool:
 def test_the_verdict_changes_at_the_margin_of_theory(
     three: bool, below: float, above: float
 ) -> None:
-    assert held(three, below, stable=False)
-    assert not held(three, below, stable=True)
-    assert held(three, above, stable=True)
-    assert not held(three, above, stable=False)
+    assert is_stable(three, below, stable=False)
+    assert not is_stable(three, below, stable=True)
+    assert is_stable(three, above, stable=True)
+    assert not is_stable(three, above, stable=False)
 
 
 @pytest.mark.long
 def test_jitter_decays_where_constant_delay_grows() -> None:
     jitter = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}
-    assert held(True, 0.6, stable=True, **jitter)
-    assert held(True, 0.6, stable=False, delay_ms=200.0)
-    assert held(True, 0.6, stable=False, **jitter, playout_ms=400.0)
+    assert is_stable(True, 0.6, stable=True, **jitter)
+    assert is_stable(True, 0.6, stable=False, delay_ms=200.0)
+    assert is_stable(True, 0.6, stable=False, **jitter, playout_ms=400.0)

@@ -59,10 +59,10 @@ print(len(trilat_net.check(sys.argv[1], seeds=[1, 2, 3], jobs=2).results), "held
 def test_trials_work_in_an_unguarded_script(quick_file: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    assert printed(script, quick_file, cwd=tmp_path) == "3 held\n"
+    assert run_script(script, quick_file, cwd=tmp_path) == "3 held\n"
 
 
-def printed(script: Path, *arguments: str | Path, cwd: Path) -> str:
+def run_script(script: Path, *arguments: str | Path, cwd: Path) -> str:
     done = subprocess.run(
         [sys.executable, str(script), *map(str, arguments)],
         cwd=cwd,

@@ -124,14 +124,14 @@ def trial() -> Trial:
     return made
 
 
-def written(folder: Path, data: bytes) -> Path:
+def write_log(folder: Path, data: bytes) -> Path:
     path = folder / "run.mcap"
     path.write_bytes(data)
     return path
 
 
 def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
-    log = written(tmp_path, recorded("free"))
+    log = write_log(tmp_path, recorded("free"))
     result = evaluate_live_log(trial, log, [], 1.0)
     assert result.held
     assert [o.key for o in result.outcomes] == [
@@ -146,14 +146,14 @@ def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Pat
 
 def test_a_session_problem_fails_the_trial(trial: Trial, tmp_path: Path) -> None:
     result = evaluate_live_log(
-        trial, written(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
+        trial, write_log(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
     )
     assert [o.key for o in result.outcomes if not o.held] == ["session"]
     assert "SIGKILL" in result.failures[0]
 
 
 def test_missing_records_fail_the_trial(trial: Trial, tmp_path: Path) -> None:
-    log = written(tmp_path, edited(recorded("free"), record=without("s", {50})))
+    log = write_log(tmp_path, edited(recorded("free"), record=without("s", {50})))
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
         "no_gaps",
         "executed again",
@@ -168,7 +168,7 @@ def test_a_record_that_contradicts_its_inputs_fails(trial: Trial, tmp_path: Path
             else record
         )
 
-    log = written(tmp_path, edited(recorded("free"), record=bent))
+    log = write_log(tmp_path, edited(recorded("free"), record=bent))
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
         "executed again"
     ]
@@ -180,9 +180,9 @@ def test_without_records_there_is_only_a_reason(
 ) -> None:
     log = tmp_path / "run.mcap"
     if content == "empty":
-        written(tmp_path, edited(recorded("free"), record=lambda _: None))
+        write_log(tmp_path, edited(recorded("free"), record=lambda _: None))
     elif isinstance(content, bytes):
-        written(tmp_path, content)
+        write_log(tmp_path, content)
     result = evaluate_live_log(trial, log, ["m1 ended with code 2"], 1.0)
     assert not result.held
     assert "m1 ended with code 2" in result.error

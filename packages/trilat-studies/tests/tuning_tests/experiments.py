@@ -35,7 +35,9 @@ def trio(*overrides: str) -> Scenario:
     return parse_scenario(TRIO, overrides=overrides)
 
 
-def asked(folder: Path, *overrides: str, text: str = TRIO, **settings: object) -> TuningPlan:
+def plan_quick_tuning(
+    folder: Path, *overrides: str, text: str = TRIO, **settings: object
+) -> TuningPlan:
     """Returns a request for a comparison in the quick scenario, as a file."""
     path = folder / "trio.toml"
     path.write_text(text)

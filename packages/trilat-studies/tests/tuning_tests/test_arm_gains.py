@@ -67,16 +67,16 @@ def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
     return tune_arm(arm, known, tip=tip, **more)  # type: ignore[arg-type]
 
 
-def assert_confirmed(found: ArmGains) -> None:
+def assert_confirmed(arm_gains: ArmGains) -> None:
     """Asserts that runs decay below the edge, grow beyond the edge, and decay at the chosen gains."""
-    stable = {run["share"]: run["stable"] for run in found.runs}
-    assert stable == {None: True, SHARES[0]: True, SHARES[1]: False}, found.summary()
-    assert found.agree
+    stable = {run["share"]: run["stable"] for run in arm_gains.runs}
+    assert stable == {None: True, SHARES[0]: True, SHARES[1]: False}, arm_gains.summary()
+    assert arm_gains.agree
 
 
-def assert_proven(found: ArmGains) -> None:
+def assert_proven(arm_gains: ArmGains) -> None:
     """Asserts that, at a margin of 2, P+d meets d > K T, which suffices whatever the masses."""
-    assert (gains(found, "d") > gains(found, "K") * 1e-3 * found.age_ms).all()
+    assert (gains(arm_gains, "d") > gains(arm_gains, "K") * 1e-3 * arm_gains.age_ms).all()
 
 
 @pytest.mark.parametrize("delay", ["0", "20ms"])
@@ -96,9 +96,9 @@ def test_runs_confirm_the_edge_of_every_arm(name: str, delay: str, tmp_path: Pat
     assert_proven(tuning)
 
 
-def gains(found: ArmGains, name: str) -> np.ndarray:
+def gains(arm_gains: ArmGains, name: str) -> np.ndarray:
     """Returns the same gain for every joint."""
-    return np.array([joint[name] for joint in found.joints])
+    return np.array([joint[name] for joint in arm_gains.joints])
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ FIT = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
 CALM = RunEnd(EndBehaviour.CONVERGED, FIT, FIT, 0.0, 0.0)
 
 
-def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
+def make_run_end(behaviour: EndBehaviour, **more: object) -> RunEnd:
     return CALM._replace(behaviour=behaviour, **more)  # type: ignore[arg-type]
 
 
@@ -31,16 +31,16 @@ def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
     ("end", "fall_rad", "apart_rad", "outcome"),
     [
         (CALM, 0.0, 0.0, CandidateClass.SETTLED),
-        (ended(EndBehaviour.DECAYS), 0.0, 0.0, CandidateClass.SETTLED),
-        (ended(EndBehaviour.HARDLY), 0.0, 0.0, CandidateClass.OPEN),
-        (ended(EndBehaviour.UNDECIDED), 0.0, 0.0, CandidateClass.OPEN),
-        (ended(EndBehaviour.GROWS, operator_acts=True), 0.0, 0.0, CandidateClass.OPEN),
-        (ended(EndBehaviour.BOUNDED), 0.0, 0.0, CandidateClass.OSCILLATED),
-        (ended(EndBehaviour.DRIFTS), 1.6, 0.0, CandidateClass.OSCILLATED),
-        (ended(EndBehaviour.GROWS), 0.0, 0.0, CandidateClass.OSCILLATED),
-        (ended(EndBehaviour.DIVERGED), 1.6, 0.5, CandidateClass.DIVERGED),
+        (make_run_end(EndBehaviour.DECAYS), 0.0, 0.0, CandidateClass.SETTLED),
+        (make_run_end(EndBehaviour.HARDLY), 0.0, 0.0, CandidateClass.OPEN),
+        (make_run_end(EndBehaviour.UNDECIDED), 0.0, 0.0, CandidateClass.OPEN),
+        (make_run_end(EndBehaviour.GROWS, operator_acts=True), 0.0, 0.0, CandidateClass.OPEN),
+        (make_run_end(EndBehaviour.BOUNDED), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (make_run_end(EndBehaviour.DRIFTS), 1.6, 0.0, CandidateClass.OSCILLATED),
+        (make_run_end(EndBehaviour.GROWS), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (make_run_end(EndBehaviour.DIVERGED), 1.6, 0.5, CandidateClass.DIVERGED),
         (CALM, 1.6, 0.5, CandidateClass.STRAYED),
-        (ended(EndBehaviour.UNDECIDED), 1.6, 0.5, CandidateClass.STRAYED),
+        (make_run_end(EndBehaviour.UNDECIDED), 1.6, 0.5, CandidateClass.STRAYED),
         (CALM, 0.1, 0.5, CandidateClass.APART),
     ],
 )
