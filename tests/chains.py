@@ -93,4 +93,4 @@ def robot_files() -> dict[str, Path]:
         )
         for name in files
     }
-    return {name: Path(str(place)) for name, place in places.items()}
+    return {name: Path(str(path)) for name, path in places.items()}

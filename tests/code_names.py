@@ -83,14 +83,14 @@ def collect_words() -> frozenset[str]:
     Every word of a test counts. The test of these names does not: it holds names that nothing defines.
     """
     program = set(house.files())
-    words = set()
+    all_words = set()
     for path in list_files():
-        words |= {*path.relative_to(house.ROOT).parts, path.stem}
+        all_words |= {*path.relative_to(house.ROOT).parts, path.stem}
         if path in program:
-            words |= set(_iterate_words_of_code(path))
+            all_words |= set(_iterate_words_of_code(path))
         elif path.name != "test_code_names.py" and _has_words(path):
-            words |= set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
-    return frozenset(words)
+            all_words |= set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+    return frozenset(all_words)
 
 
 @cache

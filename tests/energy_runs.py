@@ -78,15 +78,15 @@ def _name_columns(scenario: Scenario, name: str, rows: Any) -> Any:
 
 def least_energy(run: dict[str, Any]) -> float:
     """The least energy, J, that any end of a line or coupling, or any tank, has observed."""
-    found = [run[site].to_all.H for site in run if hasattr(run[site].to_all, "H")]
-    found += [
+    energies = [run[site].to_all.H for site in run if hasattr(run[site].to_all, "H")]
+    energies += [
         getattr(to, name)
         for site in run.values()
         for to in site.sent
         for name in ("W", "W_led", "W_followed")
         if hasattr(to, name)
     ]
-    return min(float(one.min()) for one in found)
+    return min(float(energy.min()) for energy in energies)
 
 
 def draw_energy_run(law: str, seed: int) -> Scenario:

@@ -148,9 +148,9 @@ class _Places(ast.NodeVisitor):
             (after.lineno, after.col_offset),
         )
         low, high = (bisect_left(self._tokens, (place, "")) for place in (first, last))
-        words = [token for token in self._tokens[low:high] if token[1] not in ("(", ")")]
-        if len(words) == 1 and words[0][1] in OTHERS:  # `is not` and `not in` are two
-            self._add(*words[0], OTHERS[words[0][1]])
+        tokens = [token for token in self._tokens[low:high] if token[1] not in ("(", ")")]
+        if len(tokens) == 1 and tokens[0][1] in OTHERS:  # `is not` and `not in` are two
+            self._add(*tokens[0], OTHERS[tokens[0][1]])
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         self._between(node.left, node.right)
@@ -200,7 +200,9 @@ class _Places(ast.NodeVisitor):
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         outer, given = self._parameters, node.args
-        names = [one.arg for one in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+        names = [
+            argument.arg for argument in (*given.posonlyargs, *given.args, *given.kwonlyargs)
+        ]
         for default in (*given.defaults, *filter(None, given.kw_defaults)):
             self.visit(default)
         self._parameters = [name for name in names if name not in ("self", "cls")]
@@ -225,7 +227,7 @@ class _Places(ast.NodeVisitor):
 @cache
 def find_mutants(room: str) -> list[Mutant]:
     """Returns all changes that may be drawn of a room."""
-    return [one for path in ROOMS[room] for one in _Places(path).found]
+    return [mutant for path in ROOMS[room] for mutant in _Places(path).found]
 
 
 def draw_mutants(seed: int, count: int) -> list[Mutant]:
@@ -233,9 +235,9 @@ def draw_mutants(seed: int, count: int) -> list[Mutant]:
     rng = random.Random(seed)
     shares = [count // len(ROOMS) + (n < count % len(ROOMS)) for n in range(len(ROOMS))]
     return [
-        one
+        mutant
         for room, share in zip(ROOMS, shares, strict=True)
-        for one in rng.sample(find_mutants(room), share)
+        for mutant in rng.sample(find_mutants(room), share)
     ]
 
 
@@ -288,8 +290,8 @@ def find_quick_tests(workers: int) -> list[str]:
     with tempfile.TemporaryDirectory() as made:
         copy_tree(Path(made))
         options = [f"--timeout={QUICK_S}", "--timeout-method=signal", "-rp", "tests/core"]
-        told = ask_pytest(Path(made), options, workers, **INTERPRETED).stdout
-    return re.findall(r"^PASSED (.+)$", told, re.MULTILINE)
+        output = ask_pytest(Path(made), options, workers, **INTERPRETED).stdout
+    return re.findall(r"^PASSED (.+)$", output, re.MULTILINE)
 
 
 def digest_paper(tree: Path) -> dict[str, str]:
@@ -298,10 +300,24 @@ def digest_paper(tree: Path) -> dict[str, str]:
     If they differ from those of the tree as it is, so do those of the whole run, see `tests.golden`.
     """
     path = tree.parent / "paper.mcap"
-    words = ["-m", "trilat_net", "sim", "paper", "--duration", "1", "-o", str(path), "--force"]
+    arguments = [
+        "-m",
+        "trilat_net",
+        "sim",
+        "paper",
+        "--duration",
+        "1",
+        "-o",
+        str(path),
+        "--force",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(tree), **INTERPRETED}
     ended = subprocess.run(
-        [sys.executable, *words], cwd=tree, env=environment, capture_output=True, check=False
+        [sys.executable, *arguments],
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        check=False,
     )
     return channel_digests(path) if ended.returncode == 0 else {}
 
@@ -393,10 +409,10 @@ def main() -> int:
     survivors = 0
     for mutant in drawn:
         begun_s = time.monotonic()
-        found = judge_mutant(mutant, arguments.workers)
-        survivors += not found
+        failure = judge_mutant(mutant, arguments.workers)
+        survivors += not failure
         print(
-            f"| {mutant} | {found or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |",
+            f"| {mutant} | {failure or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |",
             flush=True,
         )
     print(f"\n{len(drawn) - survivors} of {len(drawn)} are found")

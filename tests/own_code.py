@@ -142,7 +142,7 @@ class HeldArm:
     ) -> None:
         arm = facts.scenario.arms[facts.site]
         self.theta, self.lengths = arm.theta.tolist(), arm.lengths_m
-        self.M, self.B, self.K = (np.reshape(one, (2, 2)) for one in (M, B, K))
+        self.M, self.B, self.K = (np.reshape(matrix, (2, 2)) for matrix in (M, B, K))
         self.q, self.qd = np.array(facts.q0_rad), np.zeros(2)
         self.at = self.look()[0]
         self.unrest_n, self.own, self.tau = unrest_n, np.zeros(2), np.zeros(2)

@@ -35,9 +35,9 @@ class Line:
             )
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                apart = now.q[i] - peer.q[i]
-                self.integral[j][i] += now.h_s * apart
-                pull = peer.alpha * (self.K * apart + half(self.integral[j][i]))
+                difference = now.q[i] - peer.q[i]
+                self.integral[j][i] += now.h_s * difference
+                pull = peer.alpha * (self.K * difference + half(self.integral[j][i]))
                 if peer.new:
                     pull += 1e-3 * peer.tick + 0.1 * peer.age_s + 0.01 * peer.tau_x[i]
                 now.sent[j].u[i] = pull

@@ -68,22 +68,22 @@ class Walk(NamedTuple):
 @cache
 def _module_names(path: Path) -> dict[str, Place | Path | ast.expr]:
     """Returns the meanings of the names at the top of a module: definitions, modules, values."""
-    found: dict[str, Place | Path | ast.expr] = {}
+    names: dict[str, Place | Path | ast.expr] = {}
     for node in house.tree(path).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found[node.name] = Place(path, node.name)
+            names[node.name] = Place(path, node.name)
         elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            found[node.targets[0].id] = node.value
+            names[node.targets[0].id] = node.value
         elif isinstance(node, ast.ImportFrom) and node.level:
             base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
             for alias in node.names:
                 inside = (base / alias.name).with_suffix(".py")
                 module = base.with_suffix(".py")
                 if module.is_file() or inside.is_file():
-                    found[alias.asname or alias.name] = (
+                    names[alias.asname or alias.name] = (
                         Place(module, alias.name) if module.is_file() else inside
                     )
-    return found
+    return names
 
 
 @cache
@@ -225,21 +225,23 @@ class _Body:
             return self.names[node.id]
         if isinstance(node, ast.Name):
             return {
-                one
-                for one in _resolve(module, node.id)
-                if isinstance(_definition(one), ast.ClassDef)
+                place
+                for place in _resolve(module, node.id)
+                if isinstance(_definition(place), ast.ClassDef)
             }
         if isinstance(node, ast.Attribute):
             owners = self.classes(node.value)
-            found = [_member(owner, node.attr) for owner in owners]
-            known = [(one.module, part) for one, part in found if part is not None]
+            members = [_member(owner, node.attr) for owner in owners]
+            known = [(one.module, part) for one, part in members if part is not None]
             return (
                 {c for path, part in known for c in _classes_in(path, part)}
                 if known
                 else owners
             )
         if isinstance(node, ast.Call):
-            results = [(one.module, _definition(one).returns) for one in self.called(node.func)]  # type: ignore[union-attr]
+            results = [
+                (place.module, _definition(place).returns) for place in self.called(node.func)
+            ]  # type: ignore[union-attr]
             classes = {c for path, part in results if part for c in _classes_in(path, part)}
             return (
                 classes
@@ -255,22 +257,22 @@ class _Body:
 
     def called(self, node: ast.AST) -> list[Place]:
         """The functions, methods and properties of the rooms that an expression leads to."""
-        found: list[Place] = []
+        places: list[Place] = []
         if (
             isinstance(node, ast.Name)
             and isinstance(node.ctx, ast.Load)
             and node.id not in self.names
         ):
-            found = _resolve(self.place.module, node.id)
+            places = _resolve(self.place.module, node.id)
         elif isinstance(node, ast.Attribute):
             above = _module_names(self.place.module).get(getattr(node.value, "id", ""))
             owners = sorted(self.classes(node.value))
-            found = [_member(owner, node.attr)[0] for owner in owners]
-            found = [Place(above, node.attr)] if isinstance(above, Path) else found
+            places = [_member(owner, node.attr)[0] for owner in owners]
+            places = [Place(above, node.attr)] if isinstance(above, Path) else places
         return [
-            one
-            for one in found
-            if isinstance(_definition(one), ast.FunctionDef) and _in_rooms(one)
+            place
+            for place in places
+            if isinstance(_definition(place), ast.FunctionDef) and _in_rooms(place)
         ]
 
 
@@ -289,8 +291,8 @@ def _member(owner: Place, name: str) -> tuple[Place, ast.expr | None]:
         if isinstance(field.target, ast.Name) and field.target.id == name:
             return place, field.annotation
     for base in node.bases if isinstance(node, ast.ClassDef) else ():
-        for one in _classes_in(owner.module, base) - {owner}:
-            found = _member(one, name)
+        for base_class in _classes_in(owner.module, base) - {owner}:
+            found = _member(base_class, name)
             if found[1] is not None:
                 return found
     return place, None
@@ -299,7 +301,7 @@ def _member(owner: Place, name: str) -> tuple[Place, ast.expr | None]:
 def _classes_in(path: Path, part: ast.expr) -> set[Place]:
     """The classes that an annotation names."""
     found = {one for name in _names_in(part) for one in _resolve(path, name)}
-    return {one for one in found if isinstance(_definition(one), ast.ClassDef)}
+    return {place for place in found if isinstance(_definition(place), ast.ClassDef)}
 
 
 def _in_order(node: ast.AST) -> Iterator[ast.AST]:

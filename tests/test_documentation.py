@@ -68,14 +68,14 @@ def test_commands_in_sentences_have_their_options(page: str) -> None:
     for text in re.findall(r"`(trilat [^`]*)`", (ROOT / page).read_text(encoding="utf-8")):
         matches = re.findall(r"[^\s\[\]|,()]+", text)
         (name, *_) = [w for w in (" ".join(matches[:n]) for n in (3, 2, 1)) if w in OPTIONS]
-        below = [one for known, one in OPTIONS.items() if known.startswith(name)]
-        known = {option for one in below for option in one} | {
+        below = [names for known, names in OPTIONS.items() if known.startswith(name)]
+        known = {option for option_names in below for option in option_names} | {
             "--help",
             "--version",
             "--install-completion",
         }
-        given = {word.partition("=")[0] for word in matches if re.match(r"--?[a-z]", word)}
-        assert not given - known, text
+        options = {word.partition("=")[0] for word in matches if re.match(r"--?[a-z]", word)}
+        assert not options - known, text
 
 
 # --- settings ---------------------------------------------------------------------------------------------
@@ -258,9 +258,9 @@ def test_page_commands_print_their_shown_output(page: str, tmp_path: Path) -> No
 @pytest.mark.long
 @pytest.mark.live
 def test_documented_hands_take_and_release_arms(tmp_path: Path) -> None:
-    words = ("--scenario", "play", "--set", "duration_s=600")
+    arguments = ("--scenario", "play", "--set", "duration_s=600")
     sites = [
-        Process(name, ["site", name, *words], tmp_path)
+        Process(name, ["site", name, *arguments], tmp_path)
         for name in tn.load_scenario("play").names
     ]
     try:
@@ -335,19 +335,23 @@ def check_linear_examples(printed: str, _: dict[str, Any]) -> None:
 
 def check_ports(_: str, names: dict[str, Any]) -> None:
     """Compares the lines of the command on docs/studies/ports.md with those of this page's function."""
-    (block,) = (one for one in find_blocks("docs/studies/ports.md") if one.language == "sh")
+    (block,) = (
+        code_block
+        for code_block in find_blocks("docs/studies/ports.md")
+        if code_block.language == "sh"
+    )
     ((_, shown),) = read_commands(block.text)
-    made = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
-    assert shown == [" ".join(line.split()) for line in made[:2]]
+    results = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
+    assert shown == [" ".join(line.split()) for line in results[:2]]
 
 
 def check_energies(_: str, names: dict[str, Any]) -> None:
     """Asserts that a line that carries 2 N m for a second took, and gave, 2 J."""
     u = {"u": np.full((1000, 1), 2.0)}
     peers = [SimpleNamespace(sent=u, received=u)]
-    found = names["energies"](None, SimpleNamespace(h_s=1e-3, peers=peers))
-    assert found.gave[0][-1] == pytest.approx(2.0)
-    assert found.took[0][-1] == pytest.approx(2.0)
+    energies = names["energies"](None, SimpleNamespace(h_s=1e-3, peers=peers))
+    assert energies.gave[0][-1] == pytest.approx(2.0)
+    assert energies.took[0][-1] == pytest.approx(2.0)
 
 
 def check_rerun(_: str, names: dict[str, Any]) -> None:

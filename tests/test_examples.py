@@ -230,8 +230,8 @@ def test_sticks_move_targets_and_buttons_let_go(monkeypatch: pytest.MonkeyPatch)
     pad = SimpleNamespace(
         capabilities=lambda: {3: [(0, at_rest), (1, at_rest)]}, read_one=read_one
     )
-    found = SimpleNamespace(ecodes=codes, list_devices=lambda: ["a"], InputDevice=lambda _: pad)
-    monkeypatch.setitem(sys.modules, "evdev", found)
+    evdev = SimpleNamespace(ecodes=codes, list_devices=lambda: ["a"], InputDevice=lambda _: pad)
+    monkeypatch.setitem(sys.modules, "evdev", evdev)
     arm = PinnedArm(rounds=120)
     run_with_hand("gamepad_hand.py", arm, monkeypatch)
     assert arm.target == pytest.approx((1.3, 0.5), abs=0.012)
@@ -313,7 +313,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
     example = runpy.run_path(str(LOOK.with_name("record_episodes.py")))
     scenario = load_scenario("play", {"duration_s": 6.5, "link.delay_ms": 0.0})
     session = Session.whole(scenario, tmp_path)
-    found: list[bool] = []
+    outcomes: list[bool] = []
 
     def act(bus: Bus, clock: RelayClock) -> None:
         def wait_s(time_s: float) -> None:
@@ -325,7 +325,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
             open_hand(bus, clock, SESSION, "m2", scenario) as follower,
         ):
             for seconds in (4.0, 0.04):
-                found.extend(
+                outcomes.extend(
                     example["record"](
                         running,
                         hand,
@@ -342,7 +342,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
     session.stranger(act)
     log = session.run()
     marks = [event.text for event in log.events if event.kind == "mark"]
-    assert found == [True, False]
+    assert outcomes == [True, False]
     assert [text.removeprefix("episode reach 1 ") for text in marks] == [
         "begins",
         "succeeded",
@@ -404,10 +404,10 @@ def test_a_study_of_training_reports_intervals(
     short = study["STUDIES"][task]._replace(rounds=1, pairs=1)
     study["STUDIES"][task] = short
     study["run_seed"].__globals__.update(STUDIES=study["STUDIES"], TESTS=1, EPISODE_S=0.4)
-    found = [study["run_seed"](task, seed) for seed in (1, 2)]
-    assert found[0]["weights"] != found[1]["weights"]
-    spans = study["report"](found, short.measure)
+    rates = [study["run_seed"](task, seed) for seed in (1, 2)]
+    assert rates[0]["weights"] != rates[1]["weights"]
+    spans = study["report"](rates, short.measure)
     assert all(low <= mean <= high for mean, low, high in spans.values())
-    study["draw"](found, short.measure, tmp_path / "drawn.png")
+    study["draw"](rates, short.measure, tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").read_bytes().startswith(b"\x89PNG")
     assert "2 seeds, 95 % interval" in capsys.readouterr().out

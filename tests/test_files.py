@@ -162,7 +162,7 @@ def test_unsynced_folders_are_left_as_on_windows(
 @pytest.mark.push
 def test_every_written_text_states_its_line_ends() -> None:
     """A stream of text translates line ends on Windows; `write_whole` and bytes do not."""
-    found = []
+    calls = []
     for path in house.files():
         for call in (node for node in ast.walk(house.tree(path)) if isinstance(node, ast.Call)):
             name = getattr(call.func, "attr", getattr(call.func, "id", ""))
@@ -173,8 +173,8 @@ def test_every_written_text_states_its_line_ends() -> None:
                 name == "open" and {"w", "a", "x", "r+", "w+"} & {*modes}
             )
             if writes and "newline" not in {keyword.arg for keyword in call.keywords}:
-                found.append((path.name, call.lineno))
-    assert not found
+                calls.append((path.name, call.lineno))
+    assert not calls
 
 
 @pytest.mark.parametrize("exists", [False, True])
@@ -258,8 +258,10 @@ def test_concurrent_outputs_get_folders_of_their_own(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(lambda _: make_results_folder(None, "x", force=False), range(24)))
-    assert len(set(made)) == 24
+        folders = list(
+            pool.map(lambda _: make_results_folder(None, "x", force=False), range(24))
+        )
+    assert len(set(folders)) == 24
 
 
 def make_clone(folder: Path) -> None:

@@ -56,14 +56,14 @@ def test_no_command_reveals_results_before_predictions() -> None:
 @pytest.mark.long
 def test_jitter_verdicts_are_those_of_the_key(tmp_path: Path) -> None:
     (block,) = (block for block in BLOCKS if "sim jitter -o jitter.mcap" in block)
-    found = []
+    verdicts = []
     for _, command, *rest in map(shlex.split, block.splitlines()):
         if command == "sim":
             trilat(command, *rest, cwd=tmp_path)
             log = rest[rest.index("-o") + 1]
-            words = trilat("certify", log, cwd=tmp_path).out.splitlines()[0]
-            found.append(re.split(r"[;,]| m\d", words)[0])
-    assert found == [
+            first_line = trilat("certify", log, cwd=tmp_path).out.splitlines()[0]
+            verdicts.append(re.split(r"[;,]| m\d", first_line)[0])
+    assert verdicts == [
         "ok   settled: decaying",
         "FAIL not stable: growing",
         "FAIL not stable: diverged:",
@@ -116,14 +116,14 @@ def test_no_command_needs_a_unix_shell() -> None:
 def test_predictions_lie_within_10_percent_of_edges(group: int) -> None:
     """With the commands under "check yourself": about the rest of a run with d = 5."""
     _, K, T_ms, a, _, *margins = read_groups()[group - 1]
-    checks = [words for words in COMMANDS if words[1] == "linear"]
+    checks = [arguments for arguments in COMMANDS if arguments[1] == "linear"]
     assert len(checks) == 3
-    for words, predicted in zip(checks, margins, strict=True):
+    for arguments, predicted in zip(checks, margins, strict=True):
         keys: dict[str, Any] = {"control.K": K, "link.delay_ms": T_ms, "control.d": 5.0}
-        assert {"control.d=5", "control.d=0.1:5"} <= set(words)
-        if any(word.startswith("dominance") for word in words):
+        assert {"control.d=5", "control.d=0.1:5"} <= set(arguments)
+        if any(word.startswith("dominance") for word in arguments):
             keys["dominance"] = list_dominance(a)
-        loaded = trilat_net.load_scenario(words[2], keys)
+        loaded = trilat_net.load_scenario(arguments[2], keys)
         edges = [edge.value for edge in iterate_linear_edges(loaded, "control.d", 0.1, 5.0)]
         assert len(edges) == 1
         assert edges[0] <= predicted <= 1.1 * edges[0]

@@ -24,7 +24,8 @@ def apart_rad(name: str, rate_hz: int, **more: Any) -> float:
     overrides = {"rate_hz": rate_hz, "link.delay_ms": 50, **more}
     plant = {"sites.s.plant": {"class": "scene:Scene", "thing": "nothing"}}
     ours, theirs = (
-        tn.simulate(name, {**overrides, **one}, duration_s=1.5) for one in ({}, plant)
+        tn.simulate(name, {**overrides, **plant_keys}, duration_s=1.5)
+        for plant_keys in ({}, plant)
     )
     return float(np.abs(ours["s"].q - theirs["s"].q).max())
 

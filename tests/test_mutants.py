@@ -18,13 +18,13 @@ def test_a_mutant_is_one_token_of_code(seed: int) -> None:
     for mutant in mutants:
         before, after = (
             [
-                one.string
-                for one in tokenize.generate_tokens(io.StringIO(text).readline)
-                if one.string.strip()
+                token.string
+                for token in tokenize.generate_tokens(io.StringIO(text).readline)
+                if token.string.strip()
             ]
             for text in (mutant.path.read_text(encoding="utf-8"), mutant.apply())
         )
-        at = next(n for n, one in enumerate(before) if after[n] != one)
+        at = next(n for n, line in enumerate(before) if after[n] != line)
         assert before[at] == mutant.was
         assert [*before[:at], *([mutant.now] if mutant.now else []), *before[at + 1 :]] == after
         ast.parse(mutant.apply())

@@ -81,6 +81,10 @@ def test_values_show_themselves_in_a_notebook(tmp_path: Path) -> None:
         notebook, timeout=600, kernel_name="python3", resources=where
     ).execute()
     for cell, kind in zip(notebook.cells[1:], SHOWN.values(), strict=True):
-        (output,) = (one for one in cell.outputs if one.output_type == "execute_result")
+        (output,) = (
+            cell_output
+            for cell_output in cell.outputs
+            if cell_output.output_type == "execute_result"
+        )
         assert kind in output.data, cell.source
         assert len(output.data[kind]) > 200, cell.source

@@ -81,22 +81,22 @@ def keys(changes: Changes) -> Changes:
 
 
 def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[float, float]:
-    found = analyse_linear_loop(
+    analysis = analyse_linear_loop(
         load_scenario(name, changes), pose=pose, roots=1
     ).continuous.rightmost
-    assert found is not None
-    return found.s.real, abs(found.s.imag)
+    assert analysis is not None
+    return analysis.s.real, abs(analysis.s.imag)
 
 
 def root(
     name: str, changes: Changes | None = None, pose: Pose | None = None
 ) -> tuple[float, float]:
     """Returns the rightmost root that decides, the upper one of a pair."""
-    found = analyse_linear_loop(
+    analysis = analyse_linear_loop(
         load_scenario(name, changes or {}), pose=pose, roots=1
     ).decisive.rightmost
-    assert found is not None
-    return found.s.real, abs(found.s.imag)
+    assert analysis is not None
+    return analysis.s.real, abs(analysis.s.imag)
 
 
 def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
@@ -115,9 +115,9 @@ def edge(
 ) -> float:
     scenario = load_scenario(name, changes)
     rest = None if pose is None else find_equilibrium(scenario, pose)
-    found = next(iterate_linear_edges(scenario, key, low, high, rest), None)
-    assert found is not None
-    return found.value
+    edge_found = next(iterate_linear_edges(scenario, key, low, high, rest), None)
+    assert edge_found is not None
+    return edge_found.value
 
 
 def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
@@ -148,23 +148,23 @@ def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
 
 
 def learning(delay_ms: float) -> Numbers:
-    made = ports("two_sites", link__delay_ms=delay_ms)
-    assert made.proof is not None
-    assert made.proof.passive
-    (band,), least = made.velocity.minima.below, made.velocity.minima
+    analysed = ports("two_sites", link__delay_ms=delay_ms)
+    assert analysed.proof is not None
+    assert analysed.proof.passive
+    (band,), least = analysed.velocity.minima.below, analysed.velocity.minima
     return (
         *band[:2],
         least.least,
         least.least_hz,
-        *find_felt_impedance(made).interpolate_magnitudes(1.0),
-        find_felt_impedance(made).ratio_db,
+        *find_felt_impedance(analysed).interpolate_magnitudes(1.0),
+        find_felt_impedance(analysed).ratio_db,
     )
 
 
 def known(delay_ms: float) -> float:
-    made = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
-    assert made.velocity.passive
-    return float(find_felt_impedance(made).ratio_db)
+    analysed = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
+    assert analysed.velocity.passive
+    return float(find_felt_impedance(analysed).ratio_db)
 
 
 def lacking() -> Numbers:
@@ -184,9 +184,9 @@ def reflecting(delay_ms: float, d: float) -> PortAnalysis:
 
 
 def stable_with_any(delay_ms: float, d: float) -> Numbers:
-    made = reflecting(delay_ms, d)
-    assert not made.absolute.below
-    return [find_felt_impedance(made).ratio_db]
+    network = reflecting(delay_ms, d)
+    assert not network.absolute.below
+    return [find_felt_impedance(network).ratio_db]
 
 
 # -- runs
@@ -201,18 +201,18 @@ def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRu
 
 def rms_of_free(delay_ms: float) -> float:
     """Returns the RMS of e over 20 s, of all joints and sites together, rad."""
-    made = sampled(
+    records = sampled(
         load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02)
     )
-    return float(np.sqrt(((made[..., :2] - made[..., 4:6]) ** 2).mean()))
+    return float(np.sqrt(((records[..., :2] - records[..., 4:6]) ** 2).mean()))
 
 
 def measure_windows(
     name: str, quantity: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
     """Returns quantities of windows of a run, window by window."""
-    made = measured(name, keys(changes), *windows)
-    return [value(made, key, n) for n in range(len(windows)) for key in quantity.split()]
+    values = measured(name, keys(changes), *windows)
+    return [value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
 
 
 def age(**changes: Any) -> float:
@@ -577,12 +577,12 @@ def tuned(duration_s: float, changes: Changes) -> CandidateScore:
 
 
 def test_the_table_of_tuned_gains_has_every_range() -> None:
-    made = [
+    rows = [
         [law, one.name, f"{one.low:g}", f"{one.high:g}", one.unit or "-", one.where or "all"]
         for law, space in SEARCH_SPACES.items()
         for one in space.knobs
     ]
-    assert [row[:6] for row in read_table("tuned-gains.csv")] == made
+    assert [row[:6] for row in read_table("tuned-gains.csv")] == rows
 
 
 @pytest.mark.parametrize("row", ENDS)
@@ -597,26 +597,26 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
         name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
     }
     controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
-    made = tuned(
+    scores = tuned(
         30.0 if row < 4 else 6.0,
         {f"sites.{name}.control": table for name, table in controls.items()},
     )
     digit = 10.0 ** -len(reached.partition(".")[2])
-    assert (made.error_rad if row < 4 else made.settled_s) == pytest.approx(
+    assert (scores.error_rad if row < 4 else scores.settled_s) == pytest.approx(
         float(reached), abs=0.6 * digit
     )
-    assert made.effort_nm == pytest.approx(float(effort_nm), abs=0.006)
-    assert made.outcome == "settled"
+    assert scores.effort_nm == pytest.approx(float(effort_nm), abs=0.006)
+    assert scores.outcome == "settled"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("statement", AS_PRINTED)
 def test_printed_gains_repeat_the_page(statement: str) -> None:
-    made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
+    score = tuned(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
     check(
         "docs/theory/fair-comparison-results.md",
         f"| as printed{statement} | {{}} | {{}} |",
-        [made.error_rad, made.effort_nm],
+        [score.error_rad, score.effort_nm],
     )
 
 
@@ -641,9 +641,9 @@ def test_p_d_edges_lie_between_two_runs(row: int) -> None:
     assert len(EDGES) == 19
     stiffness, delay_ms, _, low, high = map(float, EDGES[row][:5])
     soft, longest_s = (SOFT, 640.0) if stiffness == SOFT["control.K"] else ({}, 320.0)
-    given = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
-    assert class_of(longest_s, **given, control__d=low).stable is False
-    assert class_of(longest_s, **given, control__d=high).stable is True
+    changes = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
+    assert class_of(longest_s, **changes, control__d=low).stable is False
+    assert class_of(longest_s, **changes, control__d=high).stable is True
 
 
 @pytest.mark.parametrize("row", range(len(LIVE_CELLS)))
@@ -652,10 +652,10 @@ def test_live_cells_have_their_class(row: int) -> None:
     assert virtual == live
     # 40 values of d each
     assert int(number) == 40 * (int(delay_ms) // 40) + round(10.0 * float(d)) - 1
-    found = class_of(
+    cell_class = class_of(
         160.0, link__delay_ms=float(delay_ms), control__d=float(d), duration_s=20.0
     )
-    assert found.value == virtual
+    assert cell_class.value == virtual
 
 
 @pytest.mark.long
@@ -663,5 +663,5 @@ def test_live_cells_have_their_class(row: int) -> None:
 def test_hardly_excited_modes_are_not_ignored(delay_ms: float, d: float) -> None:
     """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
     assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
-    found = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
-    assert found is CellClass.UNDECIDED
+    cell_class = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
+    assert cell_class is CellClass.UNDECIDED

@@ -239,16 +239,16 @@ def test_closed_windows_are_signals_as_on_windows() -> None:
 def test_priority_rises_except_in_the_main_thread() -> None:
     """Without permission nothing changes and nothing is reported."""
     before = os.getpriority(os.PRIO_PROCESS, os.getpid())
-    found: list[tuple[bool, int]] = []
+    priorities: list[tuple[bool, int]] = []
 
     def work() -> None:
         raised = process.raise_priority(before - 1)
-        found.append((raised, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
+        priorities.append((raised, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert found in ([(True, before - 1)], [(False, before)])
+    assert priorities in ([(True, before - 1)], [(False, before)])
     assert os.getpriority(os.PRIO_PROCESS, os.getpid()) == before
 
 

@@ -27,11 +27,11 @@ def run_tests(folder: Path, *options: str) -> str:
         "import tests.progress\ntests.progress.EVERY_S = 0.0\n"
     )
     paths = os.pathsep.join([str(folder), str(ROOT)])
-    given = {**os.environ, "PYTHONPATH": paths, "TRILAT_TEST_RUN": "numbers"}
+    environment = {**os.environ, "PYTHONPATH": paths, "TRILAT_TEST_RUN": "numbers"}
     command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", str(folder)]
     command += ["-p", "tests.progress", *options, "test_numbers.py"]
     done = subprocess.run(
-        command, cwd=folder, env=given, capture_output=True, text=True, check=False
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1, done
     return done.stdout

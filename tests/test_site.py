@@ -36,10 +36,12 @@ class Page(HTMLParser):
         self.feed(page.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {key: value for key, value in attrs if value}
-        self.ids |= {given[key] for key in ("id",) if key in given}
-        self.leads |= {given["href"]} if tag == "a" and "href" in given else set()
-        self.loads |= {given[key] for key in ("src", "href") if tag != "a" and key in given}
+        attributes = {key: value for key, value in attrs if value}
+        self.ids |= {attributes[key] for key in ("id",) if key in attributes}
+        self.leads |= {attributes["href"]} if tag == "a" and "href" in attributes else set()
+        self.loads |= {
+            attributes[key] for key in ("src", "href") if tag != "a" and key in attributes
+        }
 
 
 def test_the_first_pages_links_exist() -> None:
@@ -47,7 +49,7 @@ def test_the_first_pages_links_exist() -> None:
     text = MAKE.read_beside_docs("README.md") + overview.replace("](../", "](")
     named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
     assert len(named) > 60
-    places = [ROOT / "docs" / one for one in named if one not in MAKE.BESIDE]
+    places = [ROOT / "docs" / name for name in named if name not in MAKE.BESIDE]
     assert [place for place in places if not place.is_file()] == []
 
 
@@ -59,9 +61,11 @@ def test_the_menu_has_nine_entries_at_most() -> None:
     assert len(named) == len(set(named))
     docs = ROOT / "docs"
     pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
-    made = {"index.md", "SECURITY.md", "CHANGELOG.md", "LICENSE.md"}
-    made |= {f"reference/{name}.md" for name in ("commands", "python", "scenario", "scenarios")}
-    assert pages | made == set(named)
+    pages_in_menu = {"index.md", "SECURITY.md", "CHANGELOG.md", "LICENSE.md"}
+    pages_in_menu |= {
+        f"reference/{name}.md" for name in ("commands", "python", "scenario", "scenarios")
+    }
+    assert pages | pages_in_menu == set(named)
 
 
 def test_pages_are_found_in_their_menus_folder() -> None:
@@ -79,10 +83,10 @@ def test_pages_are_found_in_their_menus_folder() -> None:
 def test_pages_are_short() -> None:
     """At most 72 000 words in all; the median page has at most 1 200, none more than 2 500."""
     pages = list((ROOT / "docs").rglob("*.md"))
-    words = [len(page.read_text(encoding="utf-8").split()) for page in pages]
-    assert sum(words) <= 72_000
-    assert statistics.median(words) <= 1_200
-    assert max(words) <= 2_500
+    counts = [len(page.read_text(encoding="utf-8").split()) for page in pages]
+    assert sum(counts) <= 72_000
+    assert statistics.median(counts) <= 1_200
+    assert max(counts) <= 2_500
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1_100
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split()) <= 1_500
 
@@ -118,11 +122,15 @@ def test_the_site_is_whole() -> None:
     absent, foreign = [], []
     for path in HTML.rglob("*.html"):
         page = Page(path)
-        foreign += [(path.name, one) for one in page.loads if urlsplit(one).netloc]
-        for one in map(urlsplit, page.leads | page.loads):
-            if not (one.scheme or one.netloc) and one.path and path.name != "404.html":
-                target = path.parent / unquote(one.path)
-                absent += [(path.name, one.path)] if not target.exists() else []
+        foreign += [(path.name, address) for address in page.loads if urlsplit(address).netloc]
+        for address in map(urlsplit, page.leads | page.loads):
+            if (
+                not (address.scheme or address.netloc)
+                and address.path
+                and path.name != "404.html"
+            ):
+                target = path.parent / unquote(address.path)
+                absent += [(path.name, address.path)] if not target.exists() else []
     assert absent == []
     assert foreign == []
     check_search()
@@ -133,11 +141,11 @@ def check_search() -> None:
     nothing is fetched.
     """
     with browser_page("about:blank") as page:
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
+        requests: list[str] = []
+        page.on("request", lambda request: requests.append(request.url))
         page.goto((HTML / "maps" / "index.html").as_uri())
         page.locator(".md-search__button").first.click()
         page.locator("dialog input").first.fill("dominance")
         page.locator("dialog a", has_text="trilat set dominance").first.click()
         page.wait_for_url("**/reference/commands.html*#trilat-set-dominance")
-        assert {urlsplit(url).scheme for url in asked} <= {"file", "data", "blob"}
+        assert {urlsplit(url).scheme for url in requests} <= {"file", "data", "blob"}

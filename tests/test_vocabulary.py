@@ -56,8 +56,8 @@ def _names() -> list[str]:
 
 
 def test_at_most_sixty_words_have_one_meaning() -> None:
-    words = [word for cell, _ in USED for word in cell.split(", ")]
-    assert 30 < len(words) == len(set(words)) <= 60
+    terms = [word for cell, _ in USED for word in cell.split(", ")]
+    assert 30 < len(terms) == len(set(terms)) <= 60
 
 
 @pytest.mark.parametrize("cell", UNUSED)

@@ -64,16 +64,16 @@ def balance(
     `held_s`: for so long a torque of the law is held, which delays it by half of that.
     """
     n = len(alpha)
-    one, late = np.eye(n), alpha * np.exp(-s * delay_s)
+    identity, late = np.eye(n), alpha * np.exp(-s * delay_s)
     held = (1.0 - np.exp(-s * held_s)) / (s * held_s) if held_s else 1.0
     peer, own = (np.diag(np.broadcast_to(gain, n)) for gain in (force_peer, force_own))
     impedance = np.diag([K_h + B_h * s for K_h, B_h in [*loads, *[(0.0, 0.0)] * n][:n]])
     # s^2 x = held tau + f and (1 - c_a late) tau = -(K + B s)(1 - late) x + felt f, f: the torque on the arm,
     # tau + f being what is sent as qdd
-    slow = (one - acceleration * late) / held
-    felt = own + (peer + acceleration * one) @ late
+    slow = (identity - acceleration * late) / held
+    felt = own + (peer + acceleration * identity) @ late
     b = slow + felt
-    return slow * s**2 + (K + B * s) * (one - late) + b @ impedance, b
+    return slow * s**2 + (K + B * s) * (identity - late) + b @ impedance, b
 
 
 def transmitted(

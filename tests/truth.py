@@ -102,10 +102,10 @@ class Bound:
 
     def at(self, tick: int, t_ns: int) -> float | None:
         """Returns the bound of an offset at a tick, us; None before the first that was logged."""
-        place = bisect_right(self._ticks, tick) - 1
-        if place < 0:
+        index = bisect_right(self._ticks, tick) - 1
+        if index < 0:
             return None
-        event = self.events[place]
+        event = self.events[index]
         later_ns = max(0, t_ns - event.t_ns - SLEW_NS)
         return (event.bound_ns + later_ns * event.drift_bound_ppb / NS_PER_S) / 1000
 
@@ -113,16 +113,16 @@ class Bound:
 def judge_link(log: Log, site: str, peer: str) -> Judged:
     """Returns every sample of a link that its receiver echoed, against the truth."""
     clocks = members(log)
-    place = log.scenario.peers(site).index(peer)
+    peer_index = log.scenario.peers(site).index(peer)
     sent = {state.tick: state.sent_ns for state in log[peer].states}
     bound = Bound(log, site, peer)
     shared = clocks[site] == clocks[peer]
     rows = []
     for state in log[site].states:
-        logged = {tick: delay_us for index, tick, delay_us in state.rx if index == place}
+        logged = {tick: delay_us for index, tick, delay_us in state.rx if index == peer_index}
         for index, tick, arrived_ns in state.echo:
             limit_us = 0.0 if shared else bound.at(state.tick, state.t_ns)
-            if index == place and limit_us is not None:
+            if index == peer_index and limit_us is not None:
                 true_ns = clocks[site].true_ns(arrived_ns) - clocks[peer].true_ns(sent[tick])
                 rows.append(
                     (state.tick, true_ns / 1000, logged[tick] - true_ns / 1000, limit_us)
@@ -136,11 +136,11 @@ def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
     the drift (ppm).
     """
     clocks = members(log)
-    own, other = clocks[site], clocks[peer]
-    drift_ppm = float(other.rate / own.rate - 1) * 1e6
+    own_clock, other = clocks[site], clocks[peer]
+    drift_ppm = float(other.rate / own_clock.rate - 1) * 1e6
     rows = []
     for event in Bound(log, site, peer).events:
-        offset_ns = own.offset_to_ns(other, event.t_ns)
+        offset_ns = own_clock.offset_to_ns(other, event.t_ns)
         rows.append(
             (
                 event.t_ns / NS_PER_S,

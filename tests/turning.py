@@ -117,7 +117,8 @@ def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
         for site in scenario.names
     }
     vectors = {
-        site: [one.as_rotvec() for one in motion[:2]] for site, motion in motions.items()
+        site: [rotation.as_rotvec() for rotation in motion[:2]]
+        for site, motion in motions.items()
     }
 
     def record(fields: Record) -> Record:

@@ -51,15 +51,15 @@ def draw_rows(joints: int, rows: int = 5) -> list[Array]:
 def test_torque_inertia_gradient_and_tip_equal_pinocchios(name: str) -> None:
     arm = chain_of(name)
     for state in REFERENCES[name].states:
-        there = arm._replace(
+        placed_arm = arm._replace(
             chain=arm.chain._replace(gravity_m_s2=tuple(state.gravity.tolist()))
         )
         q, qd, v, a, r = (x[np.newaxis] for x in (state.q, state.qd, state.v, state.a, state.r))
-        torque = there.law_torque(arm.theta[np.newaxis], q, qd, v, a)[0]
+        torque = placed_arm.law_torque(arm.theta[np.newaxis], q, qd, v, a)[0]
         np.testing.assert_allclose(
             torque, state.inverse_dynamics, atol=1e-12 * (1 + np.abs(torque).max())
         )
-        gradient = there.gradient(q, qd, v, a, r)[0]
+        gradient = placed_arm.gradient(q, qd, v, a, r)[0]
         np.testing.assert_allclose(gradient, state.regressor_transpose_r, atol=1e-11)
         np.testing.assert_allclose(
             arm.multiply_inertia(q, a)[0], state.inertia @ state.a, atol=1e-12
@@ -94,9 +94,9 @@ def test_friction_and_stops_equal_the_cores() -> None:
             place_joints(rows, q[k])
             find_acceleration(rows, arm.theta, np.zeros(3), q[k], qd[k], torque[k], qdd[k])
         forces.append(smooth.multiply_inertia(q, qdd))
-    found = rough.stop_torque(q, qd) - rough.friction(qd)
+    resistance = rough.stop_torque(q, qd) - rough.friction(qd)
     assert (rough.stop_torque(q, qd) != 0.0).any(axis=0).all()
-    np.testing.assert_allclose(found, forces[0] - forces[1], atol=1e-10)
+    np.testing.assert_allclose(resistance, forces[0] - forces[1], atol=1e-10)
 
 
 def test_the_planar_arm_equals_its_chain() -> None:

@@ -363,10 +363,10 @@ def decided(peer: str, site: str) -> Site:
 @pytest.mark.parametrize(("peer", "site"), LINKS)
 def test_fates_equal_those_of_the_cores_link(peer, site):
     log, core = logs.busy().log, decided(peer, site)
-    found = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
+    delivery_ticks = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
     index = log[site].peers.index(peer)
     expected = [core.release_tick(index, sample) for sample in range(COUNT)]
-    assert found == [LOST if tick is None else tick for tick in expected]
+    assert delivery_ticks == [LOST if tick is None else tick for tick in expected]
 
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
@@ -405,5 +405,5 @@ def test_lost_samples_equal_those_of_the_link():
 
 @given(st.lists(st.integers(0, 10**14), max_size=20), st.integers(1, 20_000))
 def test_first_ticks_follow_the_grid(due_ns, rate_hz):
-    found = first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)
-    assert found.tolist() == [first_tick_at(due, rate_hz) for due in due_ns]
+    ticks = first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)
+    assert ticks.tolist() == [first_tick_at(due, rate_hz) for due in due_ns]

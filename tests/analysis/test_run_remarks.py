@@ -34,8 +34,8 @@ def test_pushes_above_half_the_limit_are_named(share: float) -> None:
         ),
     )
     limit = f"(torque limit {limit_nm:g} N m)"
-    words = f"hands or walls pushed m2 joint 1 with up to {push_nm:.3g} N m {limit}"
-    assert list_remarks(pushed) == ((words,) if share > 1.0 else ())
+    remark = f"hands or walls pushed m2 joint 1 with up to {push_nm:.3g} N m {limit}"
+    assert list_remarks(pushed) == ((remark,) if share > 1.0 else ())
 
 
 def test_late_ticks_are_counted() -> None:

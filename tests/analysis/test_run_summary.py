@@ -121,11 +121,11 @@ def test_a_held_site_has_not_diverged():
 
 def test_changes_are_reported_with_their_author():
     facts = strict(summarise_run(logs.busy().log))
-    told = [
+    changes = [
         (c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"])
         for c in facts["changes"]
     ]
-    assert told == [
+    assert changes == [
         (1.0, "a->c", "90 ms, loss 10 %", "c", None),
         (3.0, "c->a", "uniform 30 +- 17.3 ms", "a", 500),
         (4.0, "shares of c", "a 0.9, b 0.1 within 1 s", "c", None),
@@ -211,10 +211,12 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
 
 
 def test_progress_covers_the_file_once(tmp_path: Path) -> None:
-    told: list[float] = []
-    info(write_log(tmp_path, WHOLE), progress=lambda done, total: told.append(done / total))
-    assert told == sorted(told)
-    assert 0.0 < told[0] < 0.5 < told[-1] <= 1.0
+    fractions: list[float] = []
+    info(
+        write_log(tmp_path, WHOLE), progress=lambda done, total: fractions.append(done / total)
+    )
+    assert fractions == sorted(fractions)
+    assert 0.0 < fractions[0] < 0.5 < fractions[-1] <= 1.0
 
 
 def test_an_unreadable_file_is_an_error(tmp_path: Path) -> None:

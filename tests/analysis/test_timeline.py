@@ -19,13 +19,13 @@ from . import logs
 @given(st.lists(st.sampled_from(list(MODES)), max_size=60))
 def test_spans_are_ticks_of_not_following(modes):
     part = logs.in_modes(modes)
-    away = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
-    found = [
+    spans = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
+    intervals = [
         (span.mode, k)
         for span in find_mode_intervals(part)
         for k in range(round(span.from_s * part.rate_hz), round(span.to_s * part.rate_hz))
     ]
-    assert found == away
+    assert intervals == spans
     for before, after in zip(
         find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False
     ):

@@ -37,10 +37,10 @@ def grown(rate_per_s: float) -> TwinGrowth:
 
 @pytest.mark.parametrize("rate_per_s", [-0.55, -0.02, 0.0, 0.02, 0.55])
 def test_rate_of_modes_is_found_without_swing(rate_per_s: float) -> None:
-    found = grown(rate_per_s).pushes[0]
-    assert found.rate_per_s == pytest.approx(rate_per_s, abs=2e-3)
-    assert found.factor == pytest.approx(math.exp(10.0 * rate_per_s), rel=0.05)
-    assert found.joint == "s joint 1"
+    growth = grown(rate_per_s).pushes[0]
+    assert growth.rate_per_s == pytest.approx(rate_per_s, abs=2e-3)
+    assert growth.factor == pytest.approx(math.exp(10.0 * rate_per_s), rel=0.05)
+    assert growth.joint == "s joint 1"
 
 
 def test_the_words_follow_the_trend() -> None:
@@ -136,11 +136,12 @@ def test_random_directions_rarely_miss_a_growing_mode() -> None:
 def test_twins_separate_linear_and_nonlinear_motion() -> None:
     """The difference of a pendulum's swing for 1 rad is not a thousand times that for 1 mrad."""
     log = tn.simulate("p_d_margin", duration_s=8.0)
-    found = tn.twin(log, 2.0, {"m1.q1": 1e-6}, "1e-8:1")
-    assert found.linear is not None
-    assert found.linear.smallest == 1e-8
-    assert 1e-4 <= found.linear.largest <= 0.1
+    twin_report = tn.twin(log, 2.0, {"m1.q1": 1e-6}, "1e-8:1")
+    assert twin_report.linear is not None
+    assert twin_report.linear.smallest == 1e-8
+    assert 1e-4 <= twin_report.linear.largest <= 0.1
     assert (
-        f"; a push of {10 * found.linear.largest:g} goes another way: x " in found.linear.text
+        f"; a push of {10 * twin_report.linear.largest:g} goes another way: x "
+        in twin_report.linear.text
     )
-    assert len(found.to_frame()) == 9
+    assert len(twin_report.to_frame()) == 9

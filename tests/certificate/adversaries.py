@@ -97,8 +97,8 @@ def two_pairs(
     dominance = {
         i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()
     }
-    given = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
-    return experiment("pairs", **{**given, **more})
+    keys = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
+    return experiment("pairs", **{**keys, **more})
 
 
 class Row(NamedTuple):
@@ -157,14 +157,14 @@ def _margin(
     T_ms: float = 200.0,
     **more: Any,
 ) -> Callable[[], Scenario]:
-    given = {
+    keys = {
         "control.d": d,
         "link.delay_ms": T_ms,
         "rate_hz": 100,
         "duration_s": 40.0,
         **(overrides or {}),
     }
-    return _load("p_d_margin", given, **more)
+    return _load("p_d_margin", keys, **more)
 
 
 WIDER = [swinging([(0.0, 0.0), (39.98, 12.0)])]
@@ -218,8 +218,8 @@ def _swinging(
     """Returns P+d whose delay of 200 ms swings, from starts that are 1e-9 rad apart."""
     names = ("m1", "m2", "s") if name == "p_d_margin" else ("m", "s")
     starts = {
-        f"sites.{one}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)]
-        for n, one in enumerate(names)
+        f"sites.{site}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)]
+        for n, site in enumerate(names)
     }
     link = {
         "link.model": "sine",
@@ -249,9 +249,9 @@ def _turntables(
     }
     link = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 199.0, "period_s": period_s}
     arm = {"urdf": "arm6.urdf", "tip": "shoulder", "armature_kg_m2": 2.5}
-    law, given = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
+    law, keys = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
     return lambda: experiment(
-        "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **given
+        "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **keys
     )
 
 
@@ -259,12 +259,12 @@ def pair(first: Any, second: Any, **more: Any) -> Scenario:
     """Two sites that follow each other."""
     sites = {"a": {"role": "master", "q0_rad": [0.3, 0.4], **first}}
     sites["b"] = {"role": "slave", "q0_rad": [0.3, 0.4], **second}
-    given = {
+    keys = {
         "scheme": "digital",
         "sites": sites,
         "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}},
     }
-    return experiment("pair", **{**given, **more})
+    return experiment("pair", **{**keys, **more})
 
 
 def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[], Scenario]:
@@ -286,9 +286,9 @@ def _reserve(
     around = (
         {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
     )
-    made = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
+    keys = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
     return lambda: load_scenario(
-        pair(around, around, **made), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
+        pair(around, around, **keys), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
     )
 
 
@@ -321,20 +321,20 @@ def _wave(b: float, K: float, damped: float = 0.0) -> Callable[[], Scenario]:
     around = (
         {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
     )
-    made = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
-    return lambda: pair(around, around, **made)
+    keys = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
+    return lambda: pair(around, around, **keys)
 
 
 def _coasting(follows: dict[str, float], law: str = "tdpa") -> Callable[[], Scenario]:
     """A user lets go of an arm that no spring holds, and the slave follows it."""
-    led = {"K": 40.0, "B": 5.0}
+    gains = {"K": 40.0, "B": 5.0}
     push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [0.4, 0.2]}
-    made = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
-    led = led if law in ("wave", "tdpa") else {**follows}
+    keys = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
+    gains = gains if law in ("wave", "tdpa") else {**follows}
     return lambda: pair(
         {"control": {"law": law, **follows}, "hands": [push]},
-        {"control": {"law": law, **led}},
-        **made,
+        {"control": {"law": law, **gains}},
+        **keys,
     )
 
 
@@ -618,7 +618,9 @@ def find_truth(drawn: Drawn) -> Truth:
     near = False
     if drawn.key and root is not None:
         beside = [_rightmost(_scaled(drawn, factor), at) for factor in NEAR_AN_EDGE]
-        near = any(one is not None and (one > 0.0) != (root > 0.0) for one in beside)
+        near = any(
+            exponent is not None and (exponent > 0.0) != (root > 0.0) for exponent in beside
+        )
     if run.diverged_s is not None:
         return Truth(True, root, near)
     early, late = (
@@ -701,18 +703,20 @@ def _largest_difference(run: FusedRun, pushed: FusedRun, start_s: float) -> floa
     """Returns the largest difference of the speeds of two runs in a window, rad/s; both runs
     are continued.
     """
-    apart = []
+    differences = []
     for t_s in np.linspace(start_s, start_s + WINDOW_S, 21)[1:]:
         for one in (run, pushed):
             one.step_to(round(t_s * NS_PER_S))
-        apart.append(pushed.measure_distance(run, "qd"))
-    return max(apart)
+        differences.append(pushed.measure_distance(run, "qd"))
+    return max(differences)
 
 
 def has_sampled_wall(scenario: Scenario) -> bool:
     """True if a wall is held over a tick."""
     return any(
-        one.actor.sampled for spec in scenario.sites.values() for one in spec.environment
+        environment.actor.sampled
+        for spec in scenario.sites.values()
+        for environment in spec.environment
     )
 
 
@@ -909,12 +913,12 @@ def print_table(judged: list[Judged]) -> None:
     print("|---|" + " --: |" * len(Tally._fields))
     kinds = sorted({(one.drawn.has == "hidden", one.drawn.kind) for one in judged})
     for hides, kind in kinds:
-        found = [
+        groups = [
             one
             for one in judged
             if (one.drawn.has == "hidden", one.drawn.kind) == (hides, kind)
         ]
-        print(f"| {kind} | " + " | ".join(map(str, tally(found))) + " |")
+        print(f"| {kind} | " + " | ".join(map(str, tally(groups))) + " |")
     total = tally(judged)
     print("| all | " + " | ".join(map(str, total)) + " |")
     print(

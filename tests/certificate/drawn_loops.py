@@ -42,14 +42,14 @@ def _toml(value: Any) -> str:
 
 def experiment(name: str, **tables: Any) -> Scenario:
     """Returns the scenario of some tables."""
-    given = {
+    keys = {
         "name": name,
         "rate_hz": 100,
         "duration_s": 30.0,
         "scheme": "second_order",
         **tables,
     }
-    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in given.items()))
+    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in keys.items()))
 
 
 def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def _draw_noisy(rng: np.random.Generator) -> Drawn:
 
 def _draw_groups(rng: np.random.Generator) -> Drawn:
     """Draws two closed groups, one of which hides the motion of the other."""
-    made, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
+    keys, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
     d = 10.0 * T * rng.uniform([1.2, 0.7], [2.5, 1.3])
     sites = _sites(rng, "abce", 0.5)
     for n, name in enumerate("abce"):
@@ -166,8 +166,8 @@ def _draw_groups(rng: np.random.Generator) -> Drawn:
         if n >= 2:
             sites[name]["q0_rad"] = [0.1 + 1e-3 * n, 0.2]
     pairs = {"a": {"b": 1.0}, "b": {"a": 1.0}, "c": {"e": 1.0}, "e": {"c": 1.0}}
-    made |= {"sites": sites, "dominance": pairs, "link": {"delay_ms": 1e3 * T}}
-    return Drawn("groups", experiment("groups", **{**made, "control": p_d(1.0)}), "control.d")
+    keys |= {"sites": sites, "dominance": pairs, "link": {"delay_ms": 1e3 * T}}
+    return Drawn("groups", experiment("groups", **{**keys, "control": p_d(1.0)}), "control.d")
 
 
 def _draw_adaptive(rng: np.random.Generator) -> Drawn:
@@ -291,7 +291,7 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
         }
     if law == "wave" and rng.random() < 0.3:
         gains |= {"K": 0.0, "B": 0.0}
-    own: Callable[[int], dict[str, Any]] = {
+    settings: Callable[[int], dict[str, Any]] = {
         "authority": lambda n: {"leads": n < len(names) - 1},
         "impedance": lambda n: {"follows": n == len(names) - 1},
         "smith": lambda n: {"predicts": n == 0},
@@ -299,7 +299,7 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
             {"K": gains["K"], "k_f": 0.0} if n else {"K": 0.0, "k_f": gains["k_f"]}
         ),
     }.get(law, lambda _: {})
-    return [gains | own(n) for n in range(len(names))]
+    return [gains | settings(n) for n in range(len(names))]
 
 
 def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:

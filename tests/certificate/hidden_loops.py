@@ -285,7 +285,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
             "arm": hidden.arms[n],
             "control": {"law": "p_d", "K": stiffness, "d": damping},
         }
-    made: dict[str, Any] = {
+    keys: dict[str, Any] = {
         "rate_hz": loop.rate_hz,
         "duration_s": hidden.duration_s,
         "scheme": "second_order" if loop.second_order else "digital",
@@ -306,7 +306,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
         },
     }
     if hidden.earlier is not None:
-        made["timeline"] = [
+        keys["timeline"] = [
             {
                 "at_s": hidden.earlier[0],
                 "link": f"{names[j]}->{names[i]}",
@@ -315,12 +315,12 @@ def write_scenario(hidden: Hidden) -> Scenario:
             for (i, j), way in loop.ways.items()
         ]
     if loop.hold_s is not None:
-        made["on_stale"] = {
+        keys["on_stale"] = {
             "action": "hold",
             "age_ms": 1e3 * loop.hold_s,
             "return_s": loop.return_s,
         }
-    scenario = experiment("hidden", **made)
+    scenario = experiment("hidden", **keys)
     return load_scenario(scenario, laws) if hidden.own_law else scenario
 
 

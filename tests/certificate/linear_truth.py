@@ -144,8 +144,8 @@ def list_newest(
         times_us = np.array([round(US * t_s) for t_s, _ in way.points])
         table_us = np.array([round(1e3 * delay_ms) for _, delay_ms in way.points])
         loop_us = 2 * times_us[-1] - times_us[-2]
-        place = np.searchsorted(times_us, sent_us % loop_us, side="right") - 1
-        delay_us = table_us[np.maximum(place, 0)]
+        index = np.searchsorted(times_us, sent_us % loop_us, side="right") - 1
+        delay_us = table_us[np.maximum(index, 0)]
     else:
         turns = sent_us / (US * way.period_s)
         sine = np.sin(2.0 * np.pi * turns + way.phase_rad)

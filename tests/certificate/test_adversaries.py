@@ -59,15 +59,15 @@ def test_every_row_has_its_mirror() -> None:
 
 def _speed(scenario: Scenario, *at_s: float) -> list[float]:
     """Returns the largest |qd| of the second before each time."""
-    run, found = FusedRun(scenario), []
+    run, speeds = FusedRun(scenario), []
     for end_s in at_s:
         run.advance_to(end_s - 1.0)
         peaks = []
         for t_s in np.linspace(end_s - 1.0, end_s, 50):
             run.advance_to(float(t_s))
             peaks.append(np.abs(run.records[:, 2:4]).max())
-        found.append(max(peaks))
-    return found
+        speeds.append(max(peaks))
+    return speeds
 
 
 def test_every_drawn_laws_condition_has_a_value() -> None:

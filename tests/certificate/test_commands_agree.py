@@ -261,10 +261,10 @@ def test_commands_themselves_agree(folder: Path) -> None:
     with (folder / "sweep" / "results.csv").open(encoding="utf-8") as stream:
         cells = list(csv.DictReader(stream))
     compared = read_statement(folder, "compare", *(f"{d}.mcap" for d in DAMPING))
-    words = set()
+    said = set()
     for d, cell in zip(DAMPING, cells, strict=True):
         certified = read_statement(folder, "certify", f"{d}.mcap")
-        words.add(certified["stability"])
+        said.add(certified["stability"])
         assert (cell["stability"], cell["rests_on"]) == (
             certified["stability"],
             certified["rests_on"],
@@ -284,7 +284,7 @@ def test_commands_themselves_agree(folder: Path) -> None:
         pushed = read_statement(folder, "twin", f"{d}.mcap")["pushes"]
         without_text = [{key: row[key] for key in row if key != "text"} for row in pushed]
         assert without_text == certified["twins"]["pushes"]
-    assert words == {"not stable", "stable"}
+    assert said == {"not stable", "stable"}
 
 
 @pytest.mark.long

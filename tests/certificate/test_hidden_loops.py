@@ -26,10 +26,10 @@ BLOCK = 100
 @pytest.mark.push
 def test_hidden_growth_is_found(seeds: range) -> None:
     """No growing loop is called stable, and at most one in a hundred decaying loops is condemned."""
-    found = tally(map(judge_hidden, seeds))
-    assert found.false_ok == 0
-    assert found.false_alarm <= max(1, 0.01 * found.runs)
-    assert found.unstable >= 0.3 * found.runs
+    counts = tally(map(judge_hidden, seeds))
+    assert counts.false_ok == 0
+    assert counts.false_alarm <= max(1, 0.01 * counts.runs)
+    assert counts.unstable >= 0.3 * counts.runs
 
 
 @pytest.mark.parametrize("seed", [5, 12])
@@ -44,8 +44,10 @@ def test_a_law_without_permission_proves_nothing(seed: int) -> None:
 def test_small_motions_grow_at_the_true_rate(seed: int) -> None:
     """A run from next to the rest has the rate of `linear_truth`, which uses no code of the program."""
     hidden, rate_per_s = draw_hidden(seed)
-    apart = 1e-7 * np.random.default_rng(1).standard_normal(hidden.starts_rad.shape)
-    near = hidden._replace(starts_rad=hidden.pose_rad + apart, duration_s=60.0, earlier=None)
+    offsets_rad = 1e-7 * np.random.default_rng(1).standard_normal(hidden.starts_rad.shape)
+    near = hidden._replace(
+        starts_rad=hidden.pose_rad + offsets_rad, duration_s=60.0, earlier=None
+    )
     log = trilat_net.simulate(write_scenario(near))
     speeds = np.abs(np.hstack([log[name].qd for name in log.sites])).max(axis=1)
     windows = np.log(speeds[: len(speeds) // 400 * 400].reshape(-1, 400).max(axis=1))

@@ -112,8 +112,8 @@ def test_linear_loop_moves_as_the_run_does(loop: SampledLoop) -> None:
     first = np.stack([log[name].q[0] for name in loop.names])
     for periods in (1, 2):
         expected = loop.compute_angles(first, periods)
-        found = np.stack([log[name].q[periods * ticks] for name in loop.names])
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        angles = np.stack([log[name].q[periods * ticks] for name in loop.names])
+        np.testing.assert_allclose(angles, expected, atol=1e-9)
 
 
 # Row 1: a joint that grows slowly beside one that decays fast from a larger distance.

@@ -173,10 +173,10 @@ def write_arms(kind: str, folder: Path) -> list[str]:
 @pytest.mark.parametrize("kind", ARMS)
 @pytest.mark.parametrize("command", TAKERS)
 def test_bad_arms_are_named_by_every_command(command: str, kind: str, tmp_path: Path) -> None:
-    given = write_arms(kind, tmp_path)
+    settings = write_arms(kind, tmp_path)
     if command.startswith("site"):
-        given = ["--scenario", *given]
-    trilat(*command.split(), *given, cwd=tmp_path).refuses(*ARMS[kind][2])
+        settings = ["--scenario", *settings]
+    trilat(*command.split(), *settings, cwd=tmp_path).refuses(*ARMS[kind][2])
     assert {path.name for path in tmp_path.iterdir()} == {"arms.toml", "heavy.urdf"}
 
 
@@ -249,8 +249,8 @@ def test_a_pipe_is_refused_without_waiting(command: str, tmp_path: Path) -> None
 def test_pipes_are_refused_for_other_files_too(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     trilat("ping", "--zenoh-config", "pipe", cwd=tmp_path).refuses("a pipe or a device")
-    for given in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
-        options = [word for one in given for word in ("--set", one)]
+    for settings in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
+        options = [word for one in settings for word in ("--set", one)]
         trilat("scenario", "check", "two_sites", *options, cwd=tmp_path).refuses(
             "a pipe or a device"
         )
@@ -305,8 +305,8 @@ def test_foreign_text_cannot_control_a_terminal() -> None:
     with contextlib.redirect_stdout(stream):
         print_line(attack)
         print_json({"text": attack})
-    shown = re.sub(r"\x1b\[[\d;]*m", "", stream.getvalue())  # the console's own colours
-    assert all(letter.isprintable() or letter == "\n" for letter in shown)
+    plain_text = re.sub(r"\x1b\[[\d;]*m", "", stream.getvalue())  # the console's own colours
+    assert all(letter.isprintable() or letter == "\n" for letter in plain_text)
     assert json.loads("{" + stream.getvalue().rpartition("{")[2]) == {"text": attack}
 
 
@@ -320,7 +320,7 @@ def test_a_full_disk_has_one_exit_code(command: str, tmp_path: Path, short_log: 
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    words = ["sim", "paper", "--duration", "0.05", "-o", "nowhere/run.mcap"]
-    trilat(*words, cwd=tmp_path).refuses(
+    arguments = ["sim", "paper", "--duration", "0.05", "-o", "nowhere/run.mcap"]
+    trilat(*arguments, cwd=tmp_path).refuses(
         "nowhere/run.mcap: cannot be written", "; the folder nowhere does not exist"
     )

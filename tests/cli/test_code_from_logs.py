@@ -105,8 +105,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert (folder / "witness").exists()  # it does tell
     before, now = (
-        hashlib.sha256(one.encode()).hexdigest()
-        for one in (LAW, FILES["not a law"]["mylaws.py"])
+        hashlib.sha256(source.encode()).hexdigest()
+        for source in (LAW, FILES["not a law"]["mylaws.py"])
     )
     log = (folder / "run.mcap").read_bytes()
     text = opened(log).scenario_text.replace(before, now)
@@ -372,11 +372,11 @@ def test_a_different_file_is_refused_before_running(
 ) -> None:
     if text is not None:
         (log_folder / name).write_text(text)
-    asked = fact.startswith(("defines", "is not a law: the", "is not valid Python"))
+    is_asked = fact.startswith(("defines", "is not a law: the", "is not valid Python"))
     with pytest.raises(error, match=fact):
-        tn.open_log("run.mcap", law=name, other_version=asked)
+        tn.open_log("run.mcap", law=name, other_version=is_asked)
     done = trilat(
-        "verify", "run.mcap", "--law", name, *["--other-version"] * asked, cwd=log_folder
+        "verify", "run.mcap", "--law", name, *["--other-version"] * is_asked, cwd=log_folder
     )
     done.refuses(fact)
     assert not imports(log_folder)

@@ -117,8 +117,8 @@ def test_help_starts_with_one_sentence(command: str) -> None:
 def test_help_lists_all_tunable_laws() -> None:
     listed = {*list_laws(), "known"}
     assert listed == set(SEARCH_SPACES)
-    words = " ".join(re.sub("[│|]", " ", print_help("compare", "--help")).split())
-    assert all(re.search(rf"\b{law}\b", words) for law in listed)
+    text = " ".join(re.sub("[│|]", " ", print_help("compare", "--help")).split())
+    assert all(re.search(rf"\b{law}\b", text) for law in listed)
 
 
 def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:

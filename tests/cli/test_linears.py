@@ -103,7 +103,7 @@ def test_an_identified_hand_holds_the_ports(tmp_path: Path) -> None:
     )
     (tmp_path / "moved.toml").write_text(f"{shipped}\n{sines}", encoding="utf-8")
     spring = 'sites.m.hands=[{kind="tip_spring",stiffness_n_m=[50,50],damping_n_s_m=[4,4]}]'
-    told = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250")
+    settings = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250")
     # the sines move s at 11.5 rad/s
     fast = (
         "--set",
@@ -111,11 +111,11 @@ def test_an_identified_hand_holds_the_ports(tmp_path: Path) -> None:
         "-o",
         "run.mcap",
     )
-    trilat("sim", "moved.toml", "--duration", "30", *told, *fast, cwd=tmp_path).succeeds()
-    asked = ("identify", "hand", "run.mcap", "--site", "m")
-    assert "coherence" in trilat(*asked, cwd=tmp_path).succeeds()
+    trilat("sim", "moved.toml", "--duration", "30", *settings, *fast, cwd=tmp_path).succeeds()
+    arguments = ("identify", "hand", "run.mcap", "--site", "m")
+    assert "coherence" in trilat(*arguments, cwd=tmp_path).succeeds()
     (tmp_path / "m.json").write_text(
-        trilat(*asked, "--json", cwd=tmp_path).succeeds(), encoding="utf-8"
+        trilat(*arguments, "--json", cwd=tmp_path).succeeds(), encoding="utf-8"
     )
     held = ("linear", "p_d_margin_two", *AT, "--set", "control.d=1.96", "--operators", "m.json")
     line = "the measured operators at the masters, any at each: not shown at 0.001-"

@@ -120,10 +120,10 @@ def test_csv_and_npz_need_no_extra(
 
 
 def test_an_unreadable_record_leaves_no_files(folder: Path) -> None:
-    every = messages(recorded("paper"))
-    topic = next(m[0] for m in every if m[0].endswith("/s/state"))
+    all_messages = messages(recorded("paper"))
+    topic = next(m[0] for m in all_messages if m[0].endswith("/s/state"))
     (folder / "bad.mcap").write_bytes(
-        a_file(recorded("paper"), [*every, (topic, b"\x80", 0, 0, 0)])
+        a_file(recorded("paper"), [*all_messages, (topic, b"\x80", 0, 0, 0)])
     )
     done = trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder)
     done.refuses("bad.mcap: a record of s cannot be")

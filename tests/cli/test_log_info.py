@@ -99,7 +99,7 @@ def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
     facts = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
     assert not facts["sound"]
     (sequence,) = (each for each in facts["checks"] if each["check"] == "sequence")
-    assert {place["text"] for place in sequence["places"]} == {
+    assert {gap["text"] for gap in sequence["places"]} == {
         "missing s/state 7-9",
         "missing s/state 40",
     }
@@ -185,8 +185,8 @@ def test_an_empty_file_is_empty_to_every_command(arguments: list[str], tmp_path:
 def test_trailing_bytes_lose_nothing(tmp_path: Path) -> None:
     data = PADDED.read_bytes()
     write_log(tmp_path, data, "padded.mcap")
-    for words in (["log", "info"], ["log", "check"]):
-        done = trilat(*words, "padded.mcap", cwd=tmp_path)
+    for command in (["log", "info"], ["log", "check"]):
+        done = trilat(*command, "padded.mcap", cwd=tmp_path)
         assert "was finished, and 512 bytes follow its end mark" in done.err, done
         assert "was not finished" not in done.out + done.err
     done = trilat("log", "recover", "padded.mcap", cwd=tmp_path)
@@ -200,8 +200,8 @@ def test_trailing_bytes_lose_nothing(tmp_path: Path) -> None:
 
 def test_a_padded_log_is_verified(tmp_path: Path) -> None:
     write_log(tmp_path, WHOLE + bytes(4096))
-    for words in (["log", "info"], ["verify"]):
-        done = trilat(*words, "run.mcap", cwd=tmp_path)
+    for command in (["log", "info"], ["verify"]):
+        done = trilat(*command, "run.mcap", cwd=tmp_path)
         assert done.code == 0, done
         assert "4096 bytes follow its end mark" in done.err, done
     assert trilat("log", "recover", "run.mcap", cwd=tmp_path).code == 0
@@ -215,8 +215,8 @@ def without_ends(payload: bytes) -> bytes:
 def test_an_unknown_end_is_reported_everywhere(tmp_path: Path) -> None:
     write_log(tmp_path, edited(WHOLE, event=without_ends))
     sentence = "the end of m1, m2 and s is unknown"
-    for words in (["log", "info"], ["log", "check"], ["verify"]):
-        done = trilat(*words, "run.mcap", cwd=tmp_path)
+    for command in (["log", "info"], ["log", "check"], ["verify"]):
+        done = trilat(*command, "run.mcap", cwd=tmp_path)
         assert sentence in done.out + done.err, done
     facts = json.loads(trilat("log", "info", "run.mcap", "--json", cwd=tmp_path).out)
     assert facts["session"]["unknown_ends"] == ["m1", "m2", "s"]

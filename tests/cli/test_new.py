@@ -27,8 +27,8 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     assert [line for line in head.splitlines() if line.startswith("trilat")] == printed
     monkeypatch.chdir(tmp_path)
     log = tn.simulate("free", {"control.law": "soft_law:SoftLaw"}, duration_s=0.5)
-    apart = [np.ptp([log[site].q[at, 0] for site in log.scenario.names]) for at in (0, -1)]
-    assert apart[1] < 0.6 * apart[0]
+    spreads = [np.ptp([log[site].q[at, 0] for site in log.scenario.names]) for at in (0, -1)]
+    assert spreads[1] < 0.6 * spreads[0]
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("soft_law.py", "exists")
     (tmp_path / "soft_law.py").unlink()
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("test_soft_law.py", "exists")
@@ -39,9 +39,9 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
 def test_laws_compiled_anew_need_no_notice(tmp_path: Path) -> None:
     """The core is in the cache after the first run; the law is compiled by every process."""
     trilat("new", "law", "swift.py", cwd=tmp_path)
-    words = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
-    trilat(*words, "-o", "first.mcap", cwd=tmp_path).succeeds()
-    run = started(*words, "-o", "second.mcap", cwd=tmp_path)
+    arguments = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
+    trilat(*arguments, "-o", "first.mcap", cwd=tmp_path).succeeds()
+    run = started(*arguments, "-o", "second.mcap", cwd=tmp_path)
     out, err = run.communicate()
     assert "second.mcap" in out
     assert "compiling" not in err
@@ -90,8 +90,8 @@ def test_skeletons_of_hand_and_plant_run(kind: str, key: str, tmp_path: Path) ->
     assert key in ended.out
     trilat("new", kind, f"my_{kind}.py", cwd=tmp_path).refuses(f"my_{kind}.py", "exists")
     command = next(line.strip() for line in ended.out.splitlines() if "trilat sim" in line)
-    words = [*shlex.split(command)[1:], "--duration", "0.5"]
-    ran = trilat(*words, cwd=tmp_path)
+    arguments = [*shlex.split(command)[1:], "--duration", "0.5"]
+    ran = trilat(*arguments, cwd=tmp_path)
     assert ran.code == 0, ran.err
     assert trilat("verify", f"my_{kind}.mcap", cwd=tmp_path).code == 0
 

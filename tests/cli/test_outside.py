@@ -33,8 +33,8 @@ def test_the_page_works_as_written(tmp_path: Path) -> None:
     (tmp_path / "mylaws.py").write_text(code)
     commands = [shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()]
     sim, certify, report, verify, demo = commands
-    for words in (certify, report):
-        assert words[words.index("--law") + 1] == "mylaws.py"
+    for arguments in (certify, report):
+        assert arguments[arguments.index("--law") + 1] == "mylaws.py"
     trilat(*sim, "--duration", "2", cwd=tmp_path).succeeds()
     log = open_log(tmp_path / "spring.mcap")
     assert {site.control.settings["K"] for site in log.scenario.sites.values()} == {80}
@@ -103,7 +103,9 @@ def test_documented_units_are_those_of_the_interface() -> None:
         units = {row["field"]: row["unit"] for row in csv.DictReader(stream)}
     table = read_input_table()
     assert len(table) == 11
-    assert [(name, unit) for name, _, unit in table] == [(one, units[one]) for one, *_ in table]
+    assert [(name, unit) for name, _, unit in table] == [
+        (name_in_table, units[name_in_table]) for name_in_table, *_ in table
+    ]
 
 
 def test_documented_shapes_are_those_of_a_law(tmp_path: Path) -> None:

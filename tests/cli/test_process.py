@@ -249,8 +249,8 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
     )
     ended = [line for line in done.stdout.splitlines() if line.startswith("ended with")]
     assert ended == [
-        *(f"ended with 0 {' '.join(words)}" for words in alone),
-        *(f"ended with 2 {' '.join(words)}" for words in NEED_STUDIES),
+        *(f"ended with 0 {' '.join(command)}" for command in alone),
+        *(f"ended with 2 {' '.join(command)}" for command in NEED_STUDIES),
     ], done.stderr
     refused = done.stderr.splitlines()
     assert len(refused) == len(NEED_STUDIES), done.stderr

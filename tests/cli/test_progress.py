@@ -26,9 +26,9 @@ def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.String
 
 
 def work() -> None:
-    with terminal_output.progress_bar("reading run.mcap") as told:
+    with terminal_output.progress_bar("reading run.mcap") as bar:
         for done in range(0, 101, 20):
-            told(done, 100)
+            bar(done, 100)
 
 
 @pytest.mark.parametrize(("interactive", "patience_s"), [(False, 1e6), (True, 1e6)])
@@ -48,8 +48,8 @@ def test_lines_off_terminals_tell_work_and_progress(
     stream = terminal(monkeypatch, interactive=False)
     monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.0)
     monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
-    with terminal_output.progress_bar("judging run.mcap") as told:
-        told(1, 4)
+    with terminal_output.progress_bar("judging run.mcap") as bar:
+        bar(1, 4)
         for _ in range(1000):
             if stream.getvalue().count("%") >= 2:
                 break

@@ -257,8 +257,8 @@ def test_files_of_another_user_are_refused(
     key_folders: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever may write the folder above could replace the folder of keys."""
-    own = (key_folders / "k" / "m1" / MEMBERS).stat()
-    theirs = os.stat_result((own.st_mode, *own[1:4], 65533, *own[5:10]))
+    owner = (key_folders / "k" / "m1" / MEMBERS).stat()
+    theirs = os.stat_result((owner.st_mode, *owner[1:4], 65533, *owner[5:10]))
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
     with pytest.raises(UsageError, match="belongs to another user, who can change the keys"):
         member_keys._check_permissions(key_folders / MEMBERS, theirs)
@@ -349,9 +349,9 @@ def test_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
 
 def test_valid_keys_are_accepted(key_folders: Path, tmp_path: Path) -> None:
     """By a process of its own, which listens over TLS instead of TCP, and waits for the others."""
-    words = [*COMMAND, *SITE, str(key_folders / "k" / "m1"), "--join-timeout", "0"]
+    command = [*COMMAND, *SITE, str(key_folders / "k" / "m1"), "--join-timeout", "0"]
     done = subprocess.run(
-        words,
+        command,
         cwd=tmp_path,
         env={**PLAIN, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,

@@ -189,14 +189,14 @@ def test_signals_end_cold_starts_in_every_phase(seed: int, tmp_path: Path) -> No
     """While importing, reading, compiling or caching, whatever Python makes of the signal there."""
     draw = random.Random(seed)
     number, instant_s = draw.choice(ENDING_SIGNALS), draw.uniform(0.2, 8.0)
-    words = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
+    arguments = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
     command = [
         sys.executable,
         "-c",
         AT_AN_INSTANT,
         f"{instant_s:.3f}",
         str(int(number)),
-        *words,
+        *arguments,
     ]
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(

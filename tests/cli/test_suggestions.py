@@ -115,10 +115,10 @@ def test_a_setting_split_by_the_shell_needs_quotes(
         pytest.skip("needs a shell that expands braces")
     line = f"printf '%s\\n' --set {setting}"
     shell = subprocess.run([bash, "-c", line], capture_output=True, text=True, check=True)
-    words = shell.stdout.splitlines()
-    assert len(words) > 2
-    assert find_split_setting(words) == setting
-    said = in_one_line(trilat(command, "paper", *words, cwd=tmp_path).err)
+    arguments = shell.stdout.splitlines()
+    assert len(arguments) > 2
+    assert find_split_setting(arguments) == setting
+    said = in_one_line(trilat(command, "paper", *arguments, cwd=tmp_path).err)
     assert "put it into quotes" in said
     assert find_split_setting(["--set", setting, "--force"]) == ""
 
@@ -138,8 +138,8 @@ def test_whole_settings_stay_unchanged(arguments: list[str]) -> None:
 
 
 def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:
-    words = ["--set", "control.law=p_d", "--set", "control.D=1"]
-    trilat("scenario", "check", "paper", *words, cwd=tmp_path).refuses("did you mean 'd'?")
+    arguments = ["--set", "control.law=p_d", "--set", "control.D=1"]
+    trilat("scenario", "check", "paper", *arguments, cwd=tmp_path).refuses("did you mean 'd'?")
 
 
 def test_faint_similarity_suggests_nothing() -> None:
@@ -160,14 +160,14 @@ class Torques:
 @pytest.mark.parametrize("written", ["torques.py", "torques"])
 def test_a_file_as_law_suggests_its_class(written: str, tmp_path: Path) -> None:
     (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
-    words = ("sim", "two_sites", "--set", f"control.law={written}")
-    trilat(*words, cwd=tmp_path).refuses("write torques:Torques")
+    arguments = ("sim", "two_sites", "--set", f"control.law={written}")
+    trilat(*arguments, cwd=tmp_path).refuses("write torques:Torques")
 
 
 def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
-    words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
-    said = trilat(*words, "--duration", "0.1", cwd=tmp_path).err
+    arguments = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
+    said = trilat(*arguments, "--duration", "0.1", cwd=tmp_path).err
     line = (
         SUM_OF_NOTHING.splitlines().index("        return [sum_of_nothing for _ in now.q]") + 1
     )
@@ -177,8 +177,8 @@ def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:
 def test_the_next_command_permits_the_law_that_ran(tmp_path: Path) -> None:
     text = SUM_OF_NOTHING.replace("sum_of_nothing", "0.0")
     (tmp_path / "torques.py").write_text(text, "utf-8")
-    words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
-    output = trilat(*words, "--duration", "0.1", cwd=tmp_path).succeeds()
+    arguments = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
+    output = trilat(*arguments, "--duration", "0.1", cwd=tmp_path).succeeds()
     (law,) = re.findall(r"next: trilat report run\.mcap --law (\S+)", output)
     judged = trilat("verify", "run.mcap", "--law", law, cwd=tmp_path).out
     assert "200/200 records identical" in judged

@@ -41,8 +41,8 @@ def test_every_command_with_results_prints_json() -> None:
 
 def test_outputs_have_one_option_name() -> None:
     for name, names in OPTIONS.items():
-        given = {"-o", "--out", "--output"} & set(names)
-        assert not given or given >= {"-o", "--out"}, name
+        output_options = {"-o", "--out", "--output"} & set(names)
+        assert not output_options or output_options >= {"-o", "--out"}, name
 
 
 def test_the_version_is_that_of_the_package() -> None:
@@ -64,11 +64,14 @@ def test_the_version_is_that_of_the_package() -> None:
     ],
 )
 def test_shells_complete_commands(phrase: str, found: set[str]) -> None:
-    asked = {"_TRILAT_COMPLETE": "complete_fish", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    environment = {
+        "_TRILAT_COMPLETE": "complete_fish",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
     code = "from trilat_net.app.cli import app; app(prog_name='trilat')"
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={**PLAIN, **asked, "_TYPER_COMPLETE_ARGS": f"trilat {phrase}"},
+        env={**PLAIN, **environment, "_TYPER_COMPLETE_ARGS": f"trilat {phrase}"},
         capture_output=True,
         text=True,
     )
@@ -88,7 +91,7 @@ def test_created_files_are_named_in_json(tmp_path: Path) -> None:
         "s": 100,
     }
     shipped = json.loads(trilat("scenario", "list", "--json", cwd=tmp_path).succeeds())
-    assert {"free", "paper"} < {one["name"] for one in shipped}
+    assert {"free", "paper"} < {scenario["name"] for scenario in shipped}
     told = json.loads(trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds())
     assert told["sha256"] == tn.load_scenario("paper").sha256
     ran = json.loads(trilat("test", "free", "--jobs", "1", "--json", cwd=tmp_path).out)

@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_pushes_are_described_and_drawn(folder: Path) -> None:
-    asked = (
+    arguments = (
         "twin",
         "run.mcap",
         "--at",
@@ -37,21 +37,21 @@ def test_pushes_are_described_and_drawn(folder: Path) -> None:
         "-o",
         "twin.png",
     )
-    words = trilat(*asked, cwd=folder).succeeds().splitlines()
-    assert words[0].startswith("a push of 1e-06 rad at m joint 1 at 1 s becomes ")
-    assert words[1].startswith("a push of 1e-06 rad/s at s joint 2 at 1 s becomes ")
-    assert words[2].strip() == "twin.png"
+    lines = trilat(*arguments, cwd=folder).succeeds().splitlines()
+    assert lines[0].startswith("a push of 1e-06 rad at m joint 1 at 1 s becomes ")
+    assert lines[1].startswith("a push of 1e-06 rad/s at s joint 2 at 1 s becomes ")
+    assert lines[2].strip() == "twin.png"
     first = (folder / "twin.png").read_bytes()
     assert first.startswith(b"\x89PNG")
-    trilat(*asked, cwd=folder).refuses("twin.png", "--force")
-    trilat(*asked, "--force", cwd=folder).succeeds()
+    trilat(*arguments, cwd=folder).refuses("twin.png", "--force")
+    trilat(*arguments, "--force", cwd=folder).succeeds()
     assert (folder / "twin.png").read_bytes() == first
 
 
 def test_two_sizes_push_one_joint(folder: Path) -> None:
-    asked = ("twin", "run.mcap", "--push", "m.q1=1e-6", "--push", "m.q1=-1e-3")
-    words = trilat(*asked, cwd=folder).succeeds().splitlines()
-    assert [line.split()[3] for line in words] == ["1e-06", "-0.001"]
+    arguments = ("twin", "run.mcap", "--push", "m.q1=1e-6", "--push", "m.q1=-1e-3")
+    lines = trilat(*arguments, cwd=folder).succeeds().splitlines()
+    assert [line.split()[3] for line in lines] == ["1e-06", "-0.001"]
 
 
 def test_sizes_are_separated_from_linear_growth(folder: Path) -> None:

@@ -115,19 +115,19 @@ def functional(log: Log) -> tuple[np.ndarray, np.ndarray]:
     Lambda, Kp, Kd = 1.5, np.array([6.0, 4.0]), np.array([8.0, 5.0])
     V, lost = np.zeros(len(log["m"]) - DELAY), np.zeros(len(log["m"]) - DELAY)
     for site, peer in (("m", "s"), ("s", "m")):
-        here, arm = log[site], log.scenario.arms[site]
-        lengths_m = np.array([state.mem[-4:-2] for state in here.states])[DELAY:]
-        q = here.q[DELAY:]
+        records, arm = log[site], log.scenario.arms[site]
+        lengths_m = np.array([state.mem[-4:-2] for state in records.states])[DELAY:]
+        q = records.q[DELAY:]
         e = places(log, site)[DELAY:] - places(log, peer)[:-DELAY]
         r = (
-            here.qd[DELAY:]
+            records.qd[DELAY:]
             + np.linalg.solve(jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
         )
         speed = speeds(log, peer)
         stored = integral((Kd * speed**2).sum(axis=1))
         V += 0.5 * (
             (r * PlanarArmRows(arm.theta, 0.0, (1.0, 1.0)).multiply_inertia(q, r)).sum(axis=1)
-            + ((here.theta_hat[DELAY:] - arm.theta) ** 2).sum(axis=1)
+            + ((records.theta_hat[DELAY:] - arm.theta) ** 2).sum(axis=1)
             + ((lengths_m - arm.lengths_m) ** 2).sum(axis=1) / LENGTH_GAIN
             + Lambda * (Kd * e**2).sum(axis=1)
             + (stored[DELAY:] - stored[:-DELAY])
@@ -167,12 +167,14 @@ def estimated_over_true(lengths: tuple[float, float], q: tuple[float, float]) ->
 
 def test_errata_10_weight_may_be_asymmetric_and_singular() -> None:
     """With Lambda = 1 and one delay for all, the weight is the sum of J_hat J^-1 over the arms plus T I."""
-    one = estimated_over_true((0.2, 3.0), (0.0, 0.2))
-    assert np.linalg.eigvalsh(0.5 * (one + one.T)) == pytest.approx([-5.447, 8.647], abs=1e-3)
+    ratio = estimated_over_true((0.2, 3.0), (0.0, 0.2))
+    assert np.linalg.eigvalsh(0.5 * (ratio + ratio.T)) == pytest.approx(
+        [-5.447, 8.647], abs=1e-3
+    )
     # Its own eigenvalues are the ratios of the lengths, as a similar matrix shows.
-    assert np.sort(np.linalg.eigvals(one).real) == pytest.approx([0.2, 3.0])
+    assert np.sort(np.linalg.eigvals(ratio).real) == pytest.approx([0.2, 3.0])
     mirrored = estimated_over_true((0.2, 3.0), (0.5 * np.pi, -0.2))
-    weight = 0.5 * (one + mirrored)
+    weight = 0.5 * (ratio + mirrored)
     assert np.linalg.det(weight) < 0.0
     delay_s = -np.linalg.eigvals(weight).real.min()
     assert delay_s > 0.0

@@ -65,11 +65,15 @@ def mean_dissipation(log: Log, without: float) -> float:
     total = 0.0
     for weight, energy in zip(beta, energies.values(), strict=True):
         motion = energy.motion
-        found = {name: one.total.sum() for name, one in compute_dissipation(motion).items()}
+        dissipation = {
+            name: power.total.sum() for name, power in compute_dissipation(motion).items()
+        }
         opposed = (
             motion.r * motion.constants.robust_torque(motion.r)
         ).sum() * motion.records.h_s
-        total += weight * (found["damping"] + found["disagreement"] - without * opposed)
+        total += weight * (
+            dissipation["damping"] + dissipation["disagreement"] - without * opposed
+        )
     return float(total / log.scenario.duration_s)
 
 
@@ -102,7 +106,7 @@ def test_energy_closes_with_unknown_friction() -> None:
     energies = compute_site_energies(log)
     balance = compute_energy_balance(energies)
     friction = sum(
-        one.total for one in (compute_work(e.motion)["friction"] for e in energies.values())
+        power.total for power in (compute_work(e.motion)["friction"] for e in energies.values())
     )
     assert np.abs(np.cumsum(friction)).max() >= 0.01 * balance.V.max()
     assert np.abs(balance.unexplained).max() <= 2e-4 * balance.V.max()

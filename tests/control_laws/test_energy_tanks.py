@@ -107,7 +107,7 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
 def test_drawn_runs_never_have_negative_energy(law: str, seeds: range) -> None:
     """Half lost, 4g, jitter; contact and pushes; ramps of dominance; drift compensation is on."""
     least = {seed: least_energy(ticked(draw_energy_run(law, seed))) for seed in seeds}
-    assert {seed: one for seed, one in least.items() if one < -1e-9} == {}
+    assert {seed: energy for seed, energy in least.items() if energy < -1e-9} == {}
 
 
 @pytest.mark.parametrize("law", LAWS)

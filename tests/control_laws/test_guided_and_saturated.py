@@ -41,9 +41,9 @@ def three(
 
 def test_the_tangent_is_that_of_the_mathematics_library() -> None:
     values = np.concatenate([np.linspace(-25.0, 25.0, 4001), np.logspace(-300.0, 1.0, 500)])
-    found = np.array([tanh(value) for value in values])
-    assert np.abs(found - np.tanh(values)).max() <= 3e-16
-    assert (found == -np.array([tanh(-value) for value in values])).all()
+    tangents = np.array([tanh(value) for value in values])
+    assert np.abs(tangents - np.tanh(values)).max() <= 3e-16
+    assert (tangents == -np.array([tanh(-value) for value in values])).all()
     assert (tanh(0.0), tanh(math.inf), tanh(-math.inf)) == (0.0, 1.0, -1.0)
     assert math.isnan(tanh(math.nan))
 
@@ -123,18 +123,18 @@ def test_users_share_authority_and_feel_no_environment() -> None:
         rest = last_rows(scenario, 40.0)[0]
         assert rest["q"][:, 0] == pytest.approx([0.3, -0.3, slave], abs=1e-9)
         assert rest["tau_x"][:2, 0] == pytest.approx([-15.0, 45.0], abs=1e-4)
-    told = " ".join(describe_law_conditions(scenario))
+    text = " ".join(describe_law_conditions(scenario))
     bound = "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, T1 + T2 + h = 401 ms"
-    assert f"authority at m1, m2 holds: {bound}" in told
-    assert "authority at s holds: it follows and closes no loop" in told
+    assert f"authority at m1, m2 holds: {bound}" in text
+    assert "authority at s holds: it follows and closes no loop" in text
 
 
 def test_a_single_user_closes_no_loop() -> None:
     law = {"law": "authority", "K": 100.0, "d": 20.0}
     followers = {name: {"control": {"leads": False}} for name in TRIO[1:]}
     scenario = three(law, (0.75, 0.25), {TRIO[0]: {}, **followers})
-    told = " ".join(describe_law_conditions(scenario))
-    assert f"authority at {TRIO[0]} holds: nobody follows anybody" in told
+    text = " ".join(describe_law_conditions(scenario))
+    assert f"authority at {TRIO[0]} holds: nobody follows anybody" in text
 
 
 @pytest.mark.long

@@ -189,8 +189,8 @@ def test_booked_energy_is_the_arms(clamped: bool) -> None:
     step = -m.tau[:-1, 0] * np.diff(m.q[:, 0])
     assert m.sent[0].E_led[-1, 0] == pytest.approx(np.maximum(step, 0.0).sum(), rel=1e-9)
     out = np.cumsum(np.minimum(step, 0.0))
-    came = s.sent[0].E_followed[1:-50, 0]  # 50 ms ago
-    assert np.abs(m.sent[0].W_led[51:, 0] - (1e-3 + came + out[50:])).max() < 1e-12
+    earlier_energy = s.sent[0].E_followed[1:-50, 0]  # 50 ms ago
+    assert np.abs(m.sent[0].W_led[51:, 0] - (1e-3 + earlier_energy + out[50:])).max() < 1e-12
     assert least_energy(result) >= -1e-15
 
 

@@ -93,22 +93,22 @@ def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> 
 def measured(scenario: Scenario, site: str) -> float:
     """Returns the same as `transmitted` at 1 Hz, for a run in time: over its last period."""
     times_s = 8.0 + np.arange(1, 21) / 20.0
-    place = scenario.names.index(site)
+    site_index = scenario.names.index(site)
     rows = last_rows(scenario, *times_s)
     turn = np.exp(-2j * np.pi * times_s)
     torque, speed = (
-        np.array([row[name][place, 0] for row in rows]) for name in ("tau_x", "qd")
+        np.array([row[name][site_index, 0] for row in rows]) for name in ("tau_x", "qd")
     )
     return float(abs((torque @ turn) / (speed @ turn)) / abs(500.0 / (2j * np.pi) + 5.0))
 
 
 @pytest.mark.parametrize(("variant", "delay_s"), TABLE)
 def test_two_sites_transmit_as_published(variant: str, delay_s: float) -> None:
-    found = [
+    ratios = [
         transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
-    assert found == [approximate_printed(value) for value in TABLE[variant, delay_s]]
+    assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
 
 
 @pytest.mark.parametrize("a", SHARED)
@@ -164,11 +164,11 @@ def test_four_channel_runs_transmit_like_their_loop(
     variant: str, delay_s: float, acceleration: float, felt: float
 ) -> None:
     """With a part of the acceleration, as all of it is unstable; a held torque is modelled as held."""
-    found = measured(two_sites(variant, delay_s, acceleration=acceleration), "m")
+    ratio = measured(two_sites(variant, delay_s, acceleration=acceleration), "m")
     law = {**VARIANTS[variant], "acceleration": acceleration, "delay_s": delay_s}
-    assert found == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
-    assert found == pytest.approx(felt, abs=6e-5)
-    assert found == pytest.approx(transmitted(1.0, PAIR, 0, **law), rel=0.02)
+    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
+    assert ratio == pytest.approx(felt, abs=6e-5)
+    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, **law), rel=0.02)
 
 
 @pytest.mark.long

@@ -63,10 +63,10 @@ def stored(run: dict[str, Any]) -> tuple[Any, Any]:
     u_m, u_s, force_s = m.sent[0].u[:, 0], s.sent[0].u[:, 0], s.tau[:, 0]
     v_m, v_s = (m.tau[:, 0] + b * m.qd[:, 0]) / c, u_s + c / b * force_s
     waves = np.cumsum(0.5 * h * (u_m**2 - v_s**2 + u_s**2 - v_m**2))
-    given = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
+    work = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
     reserve = Wave.reserve_J
     taken = np.cumsum(h * force_s * (c * v_s - force_s) / b)
-    return waves, given + reserve - m.to_all.H[:, 0] - taken
+    return waves, work + reserve - m.to_all.H[:, 0] - taken
 
 
 def test_a_free_slave_reaches_its_master() -> None:
@@ -74,8 +74,8 @@ def test_a_free_slave_reaches_its_master() -> None:
     m, s = run["m"], run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
     assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
-    apart = np.abs(m.q - s.q)[:, 0].max()  # of qd h at 1 kHz .0476, of continuous time .0477
-    assert apart == pytest.approx(0.0477, rel=4e-3)
+    distance = np.abs(m.q - s.q)[:, 0].max()  # of qd h at 1 kHz .0476, of continuous time .0477
+    assert distance == pytest.approx(0.0477, rel=4e-3)
     assert -m.tau[:, 0].min() == pytest.approx(1.763, rel=2e-3)
 
 
@@ -137,7 +137,7 @@ def varying(period_s: float = 2.0) -> dict[str, Any]:
     sent = t - 0.2 - 0.15 * np.sin(2.0 * np.pi * t / period_s)
     stamps = np.arange(0.0, 10.0, 1e-3)
     delays = np.interp(stamps, sent, t) - stamps
-    points = ", ".join(f"{n * 1000} {round(1e6 * one)}" for n, one in enumerate(delays))
+    points = ", ".join(f"{n * 1000} {round(1e6 * delay)}" for n, delay in enumerate(delays))
     return {"model": "trace", "trace": points}
 
 

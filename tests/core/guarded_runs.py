@@ -79,8 +79,8 @@ def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 
 
     def change(site: str, tick: int, order: str) -> CoreChange:
         t_ns = tick_ns(tick, scenario.sites[site].rate_hz)
-        made = make_site_order(scenario, site, order, t_ns, ticks)
-        return to_core_change(scenario, made)
+        order_change = make_site_order(scenario, site, order, t_ns, ticks)
+        return to_core_change(scenario, order_change)
 
     commands = {
         site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
@@ -94,12 +94,12 @@ def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 
 
 def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
     """Returns the modes of a site in order, each with its reason."""
-    found: list[tuple[str, LifeReason]] = []
+    modes: list[tuple[str, LifeReason]] = []
     for state in log[site].states:
         reason = find_life_reason(read_output(state, log[site].peers))
-        if not found or found[-1] != (state.mode, reason):
-            found.append((state.mode, reason))
-    return found
+        if not modes or modes[-1] != (state.mode, reason):
+            modes.append((state.mode, reason))
+    return modes
 
 
 @functools.cache

@@ -150,12 +150,13 @@ def main() -> None:
             state = random_state(random, model.nv, weight=i == 0)
             whole = state | answer(model, chain, state)
             entry["states"].append({key: value.tolist() for key, value in whole.items()})
-    made = {
+    references = {
         "source": f"Pinocchio {pin.__version__}, tests/core/make_chain_references.py",
         "chains": chains,
     }
     PATH.write_text(
-        json.dumps(made, separators=(",", ":")).replace('},{"gravity"', '},\n{"gravity"') + "\n"
+        json.dumps(references, separators=(",", ":")).replace('},{"gravity"', '},\n{"gravity"')
+        + "\n"
     )
 
 

@@ -40,8 +40,8 @@ def centres(a: ArmLinks, q: NDArray) -> list[NDArray]:
     """Returns the centres of mass, in the vertical plane; q may be complex."""
     first, both = q[0], q[0] + q[1]
     elbow = a.l1_m * np.array([np.cos(first), np.sin(first)])
-    one = a.lc1_m * np.array([np.cos(first), np.sin(first)])
-    return [one, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
+    first_centre = a.lc1_m * np.array([np.cos(first), np.sin(first)])
+    return [first_centre, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
 
 
 def kinetic(a: ArmLinks, q: Array, qd: Array) -> float:

@@ -27,9 +27,9 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
             LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max())
         )
         share = 1.0 - h_s / left_s if left_s > h_s + 1e-9 else 0.0
-        own = part.qd[first + n]
-        slower = np.copysign(np.minimum(np.abs(share * qd_ref[-1]), np.abs(own)), own)
-        rate = np.where(qd_ref[-1] * own > 0.0, slower, 0.0) * (share > 0.0)
+        speed = part.qd[first + n]
+        slower = np.copysign(np.minimum(np.abs(share * qd_ref[-1]), np.abs(speed)), speed)
+        rate = np.where(qd_ref[-1] * speed > 0.0, slower, 0.0) * (share > 0.0)
         q_ref.append(q_ref[-1] + 0.5 * h_s * (qd_ref[-1] + rate))
         qd_ref.append(rate)
     return np.array(q_ref), np.array(qd_ref)

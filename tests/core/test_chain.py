@@ -23,14 +23,14 @@ each = pytest.mark.parametrize("name", REFERENCES)
 
 def build(name: str, **drive: float) -> Arm:
     joints = REFERENCES[name].chain.joints
-    made = [
+    fields = [
         ChainJoint(
             joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
         )
         for joint in joints
     ]
     return Arm(
-        build_chain(made, MAX_JOINTS), np.concatenate([joint.inertia for joint in joints])
+        build_chain(fields, MAX_JOINTS), np.concatenate([joint.inertia for joint in joints])
     )
 
 

@@ -68,8 +68,10 @@ def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
         arrays = build(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
         wanted = state.inverse_dynamics - 3.0 * (state.qd - state.v) + 5.0 * state.a / LAMBDA
         np.testing.assert_allclose(find_torque(arrays), wanted, rtol=1e-9, atol=1e-9)
-        found = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
-        np.testing.assert_allclose(found, state.regressor_transpose_r, rtol=1e-9, atol=1e-9)
+        transpose_rows = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
+        np.testing.assert_allclose(
+            transpose_rows, state.regressor_transpose_r, rtol=1e-9, atol=1e-9
+        )
 
 
 @each

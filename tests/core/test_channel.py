@@ -117,20 +117,22 @@ def test_losses_are_independent_of_delays() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_copies_have_their_share(seed: int) -> None:
-    made = channel([NoDelay(duplicate=0.07).to_core_model()], seed)
-    due(made, COUNT)
-    assert abs(int(made.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(0.07 * 0.93 / COUNT)
+    link_channel = channel([NoDelay(duplicate=0.07).to_core_model()], seed)
+    due(link_channel, COUNT)
+    assert abs(int(link_channel.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(
+        0.07 * 0.93 / COUNT
+    )
 
 
 def test_the_earlier_of_sample_and_copy_counts() -> None:
     """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
     link = UniformDelay(delay_ms=100, half_width_ms=60)
     single = due(channel([link.to_core_model()]), 100_000)
-    made = channel(
+    link_channel = channel(
         [UniformDelay(delay_ms=100, half_width_ms=60, duplicate=1.0).to_core_model()]
     )
-    doubled = due(made, 100_000)
-    assert made.row.copies == 100_000
+    doubled = due(link_channel, 100_000)
+    assert link_channel.row.copies == 100_000
     assert (doubled <= single).all()
     smaller_ms = (doubled - stamps(100_000)) / 1e6
     assert smaller_ms.mean() == pytest.approx(
@@ -224,8 +226,8 @@ def test_delays_are_unaffected_by_changed_loss() -> None:
     pages=st.sampled_from([64, 128, 8192]),
 )
 def test_fates_do_not_depend_on_steps(name: str, steps: list[int], pages: int) -> None:
-    made = channel([KINDS[name]], points=POINTS, pages=pages)
-    parts = [due(made, int(n)) for n in np.cumsum(steps)]
+    link_channel = channel([KINDS[name]], points=POINTS, pages=pages)
+    parts = [due(link_channel, int(n)) for n in np.cumsum(steps)]
     assert np.concatenate(parts).tolist() == fates(name, sum(steps)).tolist()
 
 
@@ -252,8 +254,8 @@ GOLDEN = {
 @pytest.mark.parametrize("name", KINDS)
 def test_golden_fates(name: str) -> None:
     """The due times of the first eight samples of m1->s with seed 1, us, or LOST."""
-    made = [LOST if ns == LOST else ns // 1000 for ns in fates(name, 8).tolist()]
-    assert made == GOLDEN[name]
+    due_us = [LOST if ns == LOST else ns // 1000 for ns in fates(name, 8).tolist()]
+    assert due_us == GOLDEN[name]
 
 
 _PROGRAM = """

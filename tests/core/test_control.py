@@ -48,9 +48,9 @@ def test_torque(
 
 @given(limit=st.floats(0.1, 100.0), ed=speeds)
 def test_torque_is_held_within_its_limit(limit: float, ed: Array) -> None:
-    one, none = np.ones(2), np.zeros(2)
+    ones, none = np.ones(2), np.zeros(2)
     tau = control.adaptive_torque(
-        ((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit
+        ((0.0,) * 5,) * 2, np.zeros(5), ones, 7.0 * ones, none, ed, limit
     )
     assert list(tau) == np.clip(-7.0 * ed, -limit, limit).tolist()
 

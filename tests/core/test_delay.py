@@ -168,8 +168,8 @@ def test_mean_and_deviation_over_a_million_draws(link: LinkBase, law: Any, seed:
 def test_a_uniform_delay_worked_out_by_hand() -> None:
     """From the published generator to microseconds, in Python's integers: purpose 2, attempt 0."""
     key = link_key(1, LINK_NAME)
-    words = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
-    units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in words]
+    draws = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
+    units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in draws]
     expected = [math.floor(200_000 + 150_000 * (2 * u - 1) + 0.5) for u in units]
     assert delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist() == expected
 

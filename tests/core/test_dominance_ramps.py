@@ -97,9 +97,9 @@ def test_the_derivative_is_the_finite_difference(first: Row, ramps: Ramps, t_ns:
     step_ns = 1000
     edges = [edge for ramp in ramps for edge in (ramp.start_ns, ramp.end_ns)]
     assume(not any(t_ns < edge <= t_ns + step_ns for edge in edges))
-    here, rates = shares(t_ns, first, ramps)
-    there, _ = shares(t_ns + step_ns, first, ramps)
-    for a, b, rate in zip(here, there, rates, strict=True):
+    share, rates = shares(t_ns, first, ramps)
+    later_share, _ = shares(t_ns + step_ns, first, ramps)
+    for a, b, rate in zip(share, later_share, rates, strict=True):
         assert (b - a) / (step_ns * 1e-9) == pytest.approx(rate, rel=1e-6, abs=1e-9)
 
 
@@ -152,11 +152,13 @@ def test_earlier_commands_precede_planned_ramps() -> None:
 
 
 def test_more_commands_than_a_run_takes_are_refused() -> None:
-    made = site()
+    site_of_run = site()
     for n in range(MAX_RAMPS):
-        made.apply_change(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
+        site_of_run.apply_change(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
     with pytest.raises(ValueError, match="256"):
-        made.apply_change(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0)
+        site_of_run.apply_change(
+            CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0
+        )
 
 
 def test_each_ramp_begins_where_the_last_was() -> None:

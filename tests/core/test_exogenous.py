@@ -204,12 +204,12 @@ def test_recorded_torque_is_linear_between_its_points(
     rows: list[tuple[float, ...]], t_s: float
 ) -> None:
     table = np.array(sorted(rows))
-    found = torque(
+    torques = torque(
         t_s, np.zeros(2), np.zeros(2), TorqueSource(TorqueKind.RECORDED, table=table)
     )
     nothing = {"left": 0.0, "right": 0.0}
     expected = [np.interp(t_s, table[:, 0], table[:, 1 + i], **nothing) for i in (0, 1)]
-    assert found == pytest.approx(expected, abs=1e-9)
+    assert torques == pytest.approx(expected, abs=1e-9)
 
 
 @given(t_s=st.floats(2.0, 20.0), ends=st.tuples(st.floats(0.1, 20.0), st.floats(0.1, 20.0)))
@@ -219,8 +219,8 @@ def test_chirps_sweep_their_frequencies_evenly_and_repeat(
     """By SciPy's chirp."""
     source = TorqueSource(TorqueKind.CHIRP, 2.0, 30.0, 2.0, 6.0, (3.0, -1.0), ends)
     sine = signal.chirp((t_s - 2.0) % 4.0, ends[0], 4.0, ends[1], phi=-90)
-    found = torque(t_s, np.zeros(2), np.zeros(2), source)
-    assert found == pytest.approx([3.0 * sine, -sine], abs=1e-6)
+    torques = torque(t_s, np.zeros(2), np.zeros(2), source)
+    assert torques == pytest.approx([3.0 * sine, -sine], abs=1e-6)
 
 
 def test_a_multisine_has_only_its_lines() -> None:
@@ -228,11 +228,11 @@ def test_a_multisine_has_only_its_lines() -> None:
     hz = (0.5, 0.75, 1.0, 2.5, 4.0, 7.0, 7.25, 9.0)
     source = Multisine(amplitude_nm=(2.0, 0.0), frequencies_hz=hz, start_s=1.0).actor
     t_s = 1.0 + np.arange(400) / 100.0
-    found = np.array([torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
-    amplitude = 2.0 * np.abs(np.fft.rfft(found)) / len(found)
+    torques = np.array([torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
+    amplitude = 2.0 * np.abs(np.fft.rfft(torques)) / len(torques)
     expected = np.where(np.isin(np.arange(201) / 4.0, hz), 2.0, 0.0)
     assert amplitude == pytest.approx(expected, abs=1e-9)
-    assert np.abs(found).max() < 0.75 * 2.0 * len(hz)
+    assert np.abs(torques).max() < 0.75 * 2.0 * len(hz)
     given_phases = Multisine(
         amplitude_nm=(1.0, 1.0), frequencies_hz=(2.0,), phases_rad=(0.5,)
     ).actor

@@ -68,8 +68,8 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
 
     start = np.concatenate([q, qd])
     exact = solve_ivp(rate, (0.0, SPAN_S), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    made = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
-    return [float(np.abs(one - exact).max() / (1 + np.abs(exact).max())) for one in made]
+    ends = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
+    return [float(np.abs(one - exact).max() / (1 + np.abs(exact).max())) for one in ends]
 
 
 @settings(max_examples=10)

@@ -84,10 +84,10 @@ def test_the_newest_due_sample_is_in_use(
     site, model = one_link(*rates_and_delay), SampleList(*rates_and_delay)
     arrivals = st.lists(st.integers(-1, 40), max_size=6)
     for k in range(25):
-        came = data.draw(arrivals)
-        for tick in came:
+        arrival_list = data.draw(arrivals)
+        for tick in arrival_list:
             model.take(k, tick)
-        output = site.step(TickInput(k, [sample(tick) for tick in came]))
+        output = site.step(TickInput(k, [sample(tick) for tick in arrival_list]))
         used = model.used(k)
         assert output.used == [used]
         if used >= 0:
@@ -128,10 +128,10 @@ def test_early_samples_leave_nearer_ones_alone() -> None:
 
 def bookkeeping_holds(delay_ms: float) -> bool:
     """Asserts that the record of tick k used tick k - 200 of each peer, and that peer's state, exactly."""
-    made = run("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
+    records = run("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
     expected = np.maximum(np.arange(2000) - 200, -1)
-    for name, site in made.sites.items():
-        peers = [made.sites[p] for p in made.scenario.peers(name)]
+    for name, site in records.sites.items():
+        peers = [records.sites[p] for p in records.scenario.peers(name)]
         if not all((site.used[:, j] == expected).all() for j in range(2)):
             return False
         mean = 0.5 * peers[0].q[:-200] + 0.5 * peers[1].q[:-200]
@@ -152,10 +152,10 @@ def test_the_check_fails_for_one_tick_less(delay_ms: float) -> None:
 
 
 def test_each_link_of_asymmetric_has_its_own_delay() -> None:
-    made = run("asymmetric", {"duration_s": 1.0})
-    for name, site in made.sites.items():
-        for j, peer in enumerate(made.scenario.peers(name)):
-            slip = round(made.scenario.links[f"{peer}->{name}"].delay_ms)
+    records = run("asymmetric", {"duration_s": 1.0})
+    for name, site in records.sites.items():
+        for j, peer in enumerate(records.scenario.peers(name)):
+            slip = round(records.scenario.links[f"{peer}->{name}"].delay_ms)
             assert (site.used[:, j] == np.maximum(np.arange(1000) - slip, -1)).all()
 
 
@@ -163,10 +163,10 @@ def test_each_link_of_asymmetric_has_its_own_delay() -> None:
 
 
 def test_a_peer_first_rests_at_its_start() -> None:
-    made = run("free", {"duration_s": 1.0})
-    starts = {name: np.array(spec.q0_rad) for name, spec in made.scenario.sites.items()}
-    for name, site in made.sites.items():
-        a, b = (starts[p] for p in made.scenario.peers(name))
+    records = run("free", {"duration_s": 1.0})
+    starts = {name: np.array(spec.q0_rad) for name, spec in records.scenario.sites.items()}
+    for name, site in records.sites.items():
+        a, b = (starts[p] for p in records.scenario.peers(name))
         assert (site.q_des[:200] == 0.5 * a + 0.5 * b).all()
         assert (site.qd_des[:200] == 0.0).all()
         assert (site.used[:200] == -1).all()

@@ -56,14 +56,14 @@ def message_at(
     k: int, target: tuple[float, ...], n: int | None = None, **fields: Any
 ) -> dict[int, Any]:
     """Returns a message of hand 7 that comes at tick k."""
-    one = {
+    message = {
         "source": 7,
         "number": k if n is None else n,
         "grip": True,
         "target": target,
         "sent_ns": k * 10**6,
     }
-    return {k: [HandCommand(**{**one, **fields})]}
+    return {k: [HandCommand(**{**message, **fields})]}
 
 
 def test_holds_begin_without_force_and_grow() -> None:
@@ -277,10 +277,10 @@ def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
     stiffness_n_m, damping_n_s_m = 300.0, 20.0
     messages: dict[int, Any] = {}
     for k in range(0, 3000, 10):
-        place = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
+        tip_m = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
         # every other 100 ms the machine hands over late
         arrives = k + gap if (k // 100) % 2 else k
-        messages.setdefault(arrives - arrives % gap, []).extend(message_at(k, place)[k])
+        messages.setdefault(arrives - arrives % gap, []).extend(message_at(k, tip_m)[k])
     for limits, least, most in ((LIMITED, 0.0, 0.85), (RULES, 0.0 if gap == 10 else 2.0, 40.0)):
         steps = hands(run(messages, 3000, limits))
         force = [

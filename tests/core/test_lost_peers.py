@@ -49,8 +49,8 @@ def test_lost_masters_shares_go_over_and_return() -> None:
     """The last sample before the cut comes into use at 3.099 s, the first after it at 4.1 s."""
     log = master_lost()
     part, other = log["s"], log["m2"]
-    found = reasons(log, "s")[-4:]
-    assert found == [
+    modes = reasons(log, "s")[-4:]
+    assert modes == [
         ("return", LifeReason.DROPPED),
         ("run", LifeReason.ALIGNED),
         ("return", LifeReason.RESTORED),
@@ -93,7 +93,11 @@ def test_degraded_runs_verify_and_close_their_energies() -> None:
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
     losses = [(site, peer, round(a, 2), round(b, 2)) for site, peer, a, b in list_losses(log)]
     assert losses == [("m2", "m1", 3.12, 4.35), ("s", "m1", 3.12, 4.35)]
-    (premise,) = (one for one in trilat_net.certify(log).premises if one.name == "shares")
+    (premise,) = (
+        premise_found
+        for premise_found in trilat_net.certify(log).premises
+        if premise_found.name == "shares"
+    )
     assert "s without m1 3.12 to 4.35 s; the remaining sites follow each other" in premise.text
 
 

@@ -31,12 +31,12 @@ def run(
 ) -> list[HandInForce]:
     """Returns the hand's state at every tick, for decisions by the tick at which they come."""
     hand = make_hand(delay)
-    found = []
+    hand_states = []
     for k in range(TICKS):
         for asked, goal in (one for at, one in decisions.items() if at == k):
             hand.accept_decision(asked, goal)
-        found.append(acted(hand, k))
-    return found
+        hand_states.append(acted(hand, k))
+    return hand_states
 
 
 @given(st.lists(st.integers(0, DELAY), min_size=5, max_size=5))
@@ -58,15 +58,15 @@ def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
 
 
 def test_hands_take_hold_after_their_delay() -> None:
-    found = run({0: (0, (0.6, -0.25))})
-    held = [k for k, one in enumerate(found) if one.source == PROGRAM]
+    hand_states = run({0: (0, (0.6, -0.25))})
+    held = [k for k, one in enumerate(hand_states) if one.source == PROGRAM]
     assert held[0] == DELAY
-    assert found[DELAY].target == PLACE
+    assert hand_states[DELAY].target == PLACE
 
 
 def test_a_decision_that_is_late_acts_at_once() -> None:
-    found = run({DELAY + 7: (0, (0.6, -0.25))})
-    assert [one.source for one in found[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
+    hand_states = run({DELAY + 7: (0, (0.6, -0.25))})
+    assert [one.source for one in hand_states[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
 
 
 def test_an_older_decision_is_ignored() -> None:
@@ -75,10 +75,10 @@ def test_an_older_decision_is_ignored() -> None:
 
 
 def test_without_decision_the_grip_fades() -> None:
-    found = run({n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)})
-    assert found[200 + DELAY].source == 0
-    assert 0.0 < found[200 + DELAY].grip <= 1.0
-    assert found[200 + DELAY + 101].grip == 0.0
+    hand_states = run({n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)})
+    assert hand_states[200 + DELAY].source == 0
+    assert 0.0 < hand_states[200 + DELAY].grip <= 1.0
+    assert hand_states[200 + DELAY + 101].grip == 0.0
 
 
 def test_hands_say_when_they_need_the_arm() -> None:

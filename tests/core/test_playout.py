@@ -41,9 +41,9 @@ def same_bits(a: Run, b: Run) -> bool:
 def test_jitter_below_budget_is_constant_bit_for_bit(name: str) -> None:
     over = {"duration_s": 2.0}
     constant = run("free", {**over, "link.delay_ms": BUDGET_MS})
-    made = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})
-    assert same_bits(made, constant)
-    assert made.stack("used").max() == 2000 - 1 - 200
+    buffered = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})
+    assert same_bits(buffered, constant)
+    assert buffered.stack("used").max() == 2000 - 1 - 200
 
 
 def trajectory(scenario: str, overrides: dict[str, Any]) -> Run:
@@ -63,10 +63,10 @@ def test_jitter_above_budget_varies() -> None:
         "half_width_ms": 100.0,
         "playout_ms": BUDGET_MS,
     }
-    made = trajectory("free", {"link": link, "duration_s": 2.0})
+    buffered = trajectory("free", {"link": link, "duration_s": 2.0})
     constant = run("free", {"duration_s": 2.0, "link.delay_ms": BUDGET_MS})
-    assert not same_bits(made, constant)
-    assert (np.diff(made.stack("used"), axis=1) >= 0).all()
+    assert not same_bits(buffered, constant)
+    assert (np.diff(buffered.stack("used"), axis=1) >= 0).all()
 
 
 def outputs(overrides: dict[str, Any]) -> list[TickRecord]:

@@ -74,9 +74,9 @@ class Watching:
 def test_laws_see_peers_external_torque_and_past() -> None:
     pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
     scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
-    made: list[Watching] = []
+    laws: list[Watching] = []
     setup = scenario.setup("m1")._replace(
-        law_factory=lambda facts: made.append(Watching(facts)) or made[-1]
+        law_factory=lambda facts: laws.append(Watching(facts)) or laws[-1]
     )
     site, records = Site(setup), []
     for k in range(20):
@@ -86,7 +86,7 @@ def test_laws_see_peers_external_torque_and_past() -> None:
             else []
         )
         records.append(site.step(TickInput(k, arrived)))
-    for k, now in enumerate(made[0].seen):
+    for k, now in enumerate(laws[0].seen):
         peer = now.peers[1]
         released = [m for m in range(2, 20, 4) if m + 5 <= k]  # 5 ms are 5 ticks
         assert peer.tick == (released[-1] if released else -1)
@@ -98,8 +98,8 @@ def test_laws_see_peers_external_torque_and_past() -> None:
         assert now.tau_before == (before.tau if before else [0.0, 0.0])
         assert now.q_before == (before.q if before else list(setup.q0))
         assert now.peers[0].tick == -1
-    assert any(now.tau_x != [0.0, 0.0] for now in made[0].seen)
-    now = made[0].seen[7]
+    assert any(now.tau_x != [0.0, 0.0] for now in laws[0].seen)
+    now = laws[0].seen[7]
     th1, th2, th3, th4, th5 = setup.theta
     c2, s2 = math.cos(now.q[1]), math.sin(now.q[1])
     outer = setup.g_m_s2 * th5 * math.cos(now.q[0] + now.q[1])

@@ -55,9 +55,9 @@ def drive(
         if any(first <= k < end for first, end in heard):
             link.used, link.used_ns, last = k, t_ns, k
         s.q_followed, s.qd_followed = np.array(s.q_des), np.array(s.qd_des)
-        there = Rotation.from_rotvec(np.array(spin) * last * 1e-3) * PEERS
+        last_pose = Rotation.from_rotvec(np.array(spin) * last * 1e-3) * PEERS
         s.q_des[:3], s.qd_des[:3] = 0.05, 0.0
-        s.q_des[3:], s.qd_des[3:] = there.as_rotvec(), spin
+        s.q_des[3:], s.qd_des[3:] = last_pose.as_rotvec(), spin
         update_session_life(t_ns, s, arrays.links)
         if rests(s):
             rate = np.array(s.xd[3:]) * max(
@@ -69,7 +69,7 @@ def drive(
             s.x[3:], s.xd[3:] = moved.as_rotvec(), rate
         else:
             s.x[3:], s.xd[3:] = s.q_des[3:], s.qd_des[3:]
-        rows.append((s.mode, *s.q_des[3:], *s.qd_des[3:], *there.as_rotvec()))
+        rows.append((s.mode, *s.q_des[3:], *s.qd_des[3:], *last_pose.as_rotvec()))
     table = np.array(rows)
     return {
         "mode": table[:, 0],
@@ -81,8 +81,8 @@ def drive(
 
 def steps(turns: Array) -> Array:
     """Returns the turn from each orientation to the next."""
-    found = Rotation.from_rotvec(turns.copy())
-    return np.asarray((found[1:] * found[:-1].inv()).as_rotvec())
+    rotations = Rotation.from_rotvec(turns.copy())
+    return np.asarray((rotations[1:] * rotations[:-1].inv()).as_rotvec())
 
 
 @pytest.mark.long
@@ -94,8 +94,8 @@ def test_arms_take_the_shortest_allowed_turn() -> None:
     assert len(aligning) == int(np.ceil(takes))
     x = (aligning - aligning[0]) / takes
     wanted = Slerp([0.0, 1.0], Rotation.concatenate([OWN, PEERS]))(x * x * (3.0 - 2.0 * x))
-    found = Rotation.from_rotvec(run["turn"][aligning])
-    assert (found * wanted.inv()).magnitude().max() <= 1e-12
+    rotations = Rotation.from_rotvec(run["turn"][aligning])
+    assert (rotations * wanted.inv()).magnitude().max() <= 1e-12
     assert np.linalg.norm(run["rate"], axis=1).max() == pytest.approx(SPEED, rel=1e-6)
 
 
@@ -120,11 +120,11 @@ def test_silent_peers_never_make_orientations_jump() -> None:
     assert np.ptp(run["turn"][3630:4600], axis=0).max() <= 1e-12
     assert holding[3521:4600].all()
     following = modes == Mode.RUN
-    apart = (
+    distances = (
         Rotation.from_rotvec(run["turn"][following])
         * Rotation.from_rotvec(run["peers"][following]).inv()
     )
-    assert apart.magnitude().max() <= 1e-12
+    assert distances.magnitude().max() <= 1e-12
 
 
 @pytest.mark.long
@@ -246,10 +246,10 @@ def test_energies_close_over_a_task_space_hold() -> None:
     energies = compute_site_energies(log)
     balance = compute_energy_balance(energies)
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
-    one, modes = energies["s"], log["s"].mode
+    energy, modes = energies["s"], log["s"].mode
     first = int(np.flatnonzero(modes == "hold")[0])
     assert set(modes[first : first + 1400]) == {"hold"}
-    assert measure_torque_error(one.motion).max() <= 1e-9
+    assert measure_torque_error(energy.motion).max() <= 1e-9
     assert verify(log).differing == 0
 
 

@@ -167,13 +167,15 @@ def test_motors_can_hold_every_credible_estimate() -> None:
     moment = 200.0 / 9.81
     assert gains.low == (0.0,) * 5
     assert gains.high == pytest.approx((2.0 * moment, moment, moment, moment, moment))
-    own = {
+    own_estimate = {
         "control.law": "adaptive_box",
         "control.theta_low": [-1.0] * 5,
         "control.theta_high": [9.0] * 5,
     }
     assert (
-        load_scenario("free", {"on_stale.action": "glide", **own}).setup("m1").gains.high
+        load_scenario("free", {"on_stale.action": "glide", **own_estimate})
+        .setup("m1")
+        .gains.high
         == (9.0,) * 5
     )
     assert np.isinf(load_scenario("free").setup("m1").gains.high).all()

@@ -64,8 +64,8 @@ def test_a_passed_limit_is_a_lasting_fault(
 ) -> None:
     scenario = guarded(limits, where="sites.s.")
     log = ordered(scenario, {"m": {4500: "enable"}, "s": {4500: "stop", 5000: "reset"}})
-    found = reasons(log, "s")
-    assert ("fault", reason) in found
+    modes = reasons(log, "s")
+    assert ("fault", reason) in modes
     at = list(log["s"].mode).index("fault")
     assert set(log["s"].mode[at:5000]) == {"fault"}  # no other order ends it
     assert "diverged" not in set(log["m"].mode)

@@ -42,8 +42,8 @@ def test_stacked_tables_hold_each_sites_own() -> None:
     scenario = load_scenario("windup")
     setups = [scenario.setup(name) for name in scenario.names]
     whole = stack_site_arrays(setups)
-    for n, one in enumerate(setups):
-        site_arrays = build_site_arrays(one)
+    for n, setup_of_lane in enumerate(setups):
+        site_arrays = build_site_arrays(setup_of_lane)
         assert whole.site[n].tobytes() == site_arrays.site.tobytes()
         assert whole.links[n].tobytes() == site_arrays.links.tobytes()
         assert whole.ramps[n].tobytes() == site_arrays.ramps.tobytes()

@@ -215,9 +215,11 @@ def test_too_many_arrivals_in_a_tick_are_refused() -> None:
 def test_arrival_checksums_cover_their_bytes() -> None:
     """rx_crc: little-endian (peer i64, tick i64, q f64s, qd f64s) of each arrival."""
 
-    came = [
+    arrivals_made = [
         Arrival(1, 5, (0.1, -0.0), (3.0, 4.0), 77),
         Arrival(0, 2, (1.0, 2.0), (0.5, 5e-324), 9),
     ]
-    packed = b"".join(struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in came)
-    assert Site(setup()).step(TickInput(0, came)).rx_crc == zlib.crc32(packed)
+    packed = b"".join(
+        struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in arrivals_made
+    )
+    assert Site(setup()).step(TickInput(0, arrivals_made)).rx_crc == zlib.crc32(packed)

@@ -125,9 +125,9 @@ def test_peers_without_share_may_be_stale() -> None:
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     """A diverged record holds no reference."""
-    made = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
+    stale_site = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
     outputs = stepped(
-        made,
+        stale_site,
         [
             TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else [])
             for k in range(120)
@@ -162,10 +162,12 @@ def test_modes_and_references_follow_the_law(
     shares: tuple[float, float],
 ) -> None:
     """For any pattern of arrivals: the edges of `Mode`, and the reference of each mode."""
-    made = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
+    stale_site = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
     mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
     for k, flags in enumerate(heard):
-        output = made.step(TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k]))
+        output = stale_site.step(
+            TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k])
+        )
         ages = [k - max(used, 0) for used in output.used]
         stale = any(share > 0 and age > age_ms for share, age in zip(shares, ages, strict=True))
         if action is not StaleAction.USE:
@@ -218,7 +220,7 @@ def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
     """In any mode, because the records hold the site's memory."""
     rule = RULE._replace(action=action)
     whole = cut(rule)
-    made = site(rule)
+    stale_site = site(rule)
     last = whole[k - 1]
     in_use = [moving(j, m) for j, m in enumerate(last.used)]
     heard = [
@@ -227,9 +229,9 @@ def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
         for m in range(last.used[j] + 1, k - 1)
         if not (j and 50 <= m < 90)
     ]
-    made.restore_links(k, in_use, [moving(j, m) for j, m in heard])
-    made.restore_state(whole[k - 2], last)
-    assert stepped(made, cut_ticks()[k:]) == whole[k:]
+    stale_site.restore_links(k, in_use, [moving(j, m) for j, m in heard])
+    stale_site.restore_state(whole[k - 2], last)
+    assert stepped(stale_site, cut_ticks()[k:]) == whole[k:]
 
 
 # What it is good for.
@@ -240,8 +242,8 @@ def test_ramped_returns_remove_kicks_after_outages() -> None:
     """Scenario `outage`: the slave is cut off while its master moves, and all samples arrive at once."""
 
     def kick(action: str) -> float:
-        made = trajectories(load_scenario("outage", {"on_stale.action": action}))
-        healed = made.sites["s"].t_s >= made.scenario.links["m1->s"].outages_s[0][1]
-        return float(np.abs(made.sites["s"].qd[healed]).max())
+        runs_made = trajectories(load_scenario("outage", {"on_stale.action": action}))
+        healed = runs_made.sites["s"].t_s >= runs_made.scenario.links["m1->s"].outages_s[0][1]
+        return float(np.abs(runs_made.sites["s"].qd[healed]).max())
 
     assert kick("hold") < 0.6 * kick("use")

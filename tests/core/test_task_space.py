@@ -85,8 +85,8 @@ def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
     before, after = (
         np.array(place_row(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0)
     )
-    here = place_row(arrays, q, qd)
-    assert np.abs((after - before) / (2 * h) - here.Jd).max() <= 1e-7
+    row = place_row(arrays, q, qd)
+    assert np.abs((after - before) / (2 * h) - row.Jd).max() <= 1e-7
     low, high = (np.array(place_row(arrays, q + sign * h * qd, qd).x) for sign in (-1.0, 1.0))
     xd = np.array(place_row(arrays, q, qd).xd)
     assert np.abs((high - low)[:3] / (2 * h) - xd[:3]).max() <= 1e-7
@@ -116,17 +116,17 @@ def test_reference_acceleration_differentiates_reference_velocity(
     qd = np.linspace(-0.3, 0.4, 7)
     x = np.array(place_row(arrays, q, qd).x)
     x[:3] += 0.05
-    found = []
+    errors = []
     for sign in (-1.0, 0.0, 1.0):
         s = place_row(arrays, q + sign * h * qd, qd)
         s.q_des, s.qd_des = x, 0.0
         update_task_errors(s)
-        found.append((np.array(s.v), np.array(s.a)))
-    rate = (found[2][0] - found[0][0]) / (2 * h)
+        errors.append((np.array(s.v), np.array(s.a)))
+    rate = (errors[2][0] - errors[0][0]) / (2 * h)
     if task is PLACE:
-        assert np.abs(rate - found[1][1]).max() <= 1e-6
+        assert np.abs(rate - errors[1][1]).max() <= 1e-6
     else:  # the orientation's error is linear in the turn only near 0, where it is here
-        assert np.abs(rate - found[1][1]).max() <= 1e-5
+        assert np.abs(rate - errors[1][1]).max() <= 1e-5
 
 
 def test_damping_begins_below_its_singular_value() -> None:

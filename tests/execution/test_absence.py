@@ -122,7 +122,15 @@ def renumber(draw: Callable, taken: Pieces) -> None:
 
 def change_metadata(draw: Callable, taken: Pieces) -> None:
     """Changes, adds or removes an entry of any metadata, including a channel's; or removes all metadata."""
-    entry = draw(st.sampled_from([one for one in taken.about if hasattr(one, "metadata")]))
+    entry = draw(
+        st.sampled_from(
+            [
+                entry_of_file
+                for entry_of_file in taken.about
+                if hasattr(entry_of_file, "metadata")
+            ]
+        )
+    )
     key = draw(st.sampled_from([*entry.metadata, "new"]))
     match draw(st.sampled_from(["change", "drop", "rename"])):
         case "drop" if key != "new":
@@ -137,9 +145,13 @@ def change_metadata(draw: Callable, taken: Pieces) -> None:
 
 def change_description(draw: Callable, taken: Pieces) -> None:
     """Changes a byte of the scenario or of a schema."""
-    entry = draw(st.sampled_from([one for one in taken.about if hasattr(one, "data")]))
-    place = draw(st.integers(0, len(entry.data) - 1))
-    entry.data = entry.data[:place] + bytes([entry.data[place] ^ 1]) + entry.data[place + 1 :]
+    entry = draw(
+        st.sampled_from(
+            [entry_of_file for entry_of_file in taken.about if hasattr(entry_of_file, "data")]
+        )
+    )
+    index = draw(st.integers(0, len(entry.data) - 1))
+    entry.data = entry.data[:index] + bytes([entry.data[index] ^ 1]) + entry.data[index + 1 :]
 
 
 def change_message(draw: Callable, taken: Pieces) -> None:
@@ -254,19 +266,20 @@ def test_a_claimed_rerun_is_executed_whole() -> None:
 
 def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(recorded("free"))
-    made = tmp_path / "again.mcap"
-    rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(made)
-    verdict = verify(open_log(made))
+    log_path = tmp_path / "again.mcap"
+    rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(log_path)
+    verdict = verify(open_log(log_path))
     assert verdict.passed
     assert verdict.identical == 3 * TICKS
     forged = edited(
-        made.read_bytes(), record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r
+        log_path.read_bytes(),
+        record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r,
     )
-    made.write_bytes(forged)
-    assert verify(open_log(made)).first[:3] == ("m1", 0, "record")
+    log_path.write_bytes(forged)
+    assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
     (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")
-    alone = run_log_checks(open_log(made), virtual=True)
+    alone = run_log_checks(open_log(log_path), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)
 

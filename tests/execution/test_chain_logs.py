@@ -111,20 +111,20 @@ def test_a_planar_arm_equals_its_chain() -> None:
     for law in ({"law": "adaptive", "Gamma": 0.0}, {"law": "p_d", "K": 30.0, "d": 4.0}):
         logs = []
         for arm in (PLANAR, {"urdf": "two.urdf", "down": [0.0, -1.0, 0.0]}):
-            given = {
+            settings = {
                 "arm": arm,
                 "control": law,
                 "duration_s": 2.0,
                 "expect": {},
                 "limits.qd_limit_rad_s": 100.0,
             }
-            given |= {"limits.tau_limit_nm": 200.0} | (
+            settings |= {"limits.tau_limit_nm": 200.0} | (
                 {"urdf": {"two.urdf": TWO_LINKS}} if "urdf" in arm else {}
             )
-            plain = load_scenario("paper", given)
+            plain = load_scenario("paper", settings)
             if law["law"] == "adaptive":
-                given["control"] = {**law, "theta_hat0": plain.arms["s"].theta.tolist()}
-            logs.append(simulate_scenario(load_scenario("paper", given)))
+                settings["control"] = {**law, "theta_hat0": plain.arms["s"].theta.tolist()}
+            logs.append(simulate_scenario(load_scenario("paper", settings)))
         for site in logs[0].sites:
             for name in ("q", "qd", "tau", "q_des"):
                 planar, chain = (getattr(log[site], name) for log in logs)

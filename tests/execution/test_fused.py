@@ -63,15 +63,15 @@ def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
 
 def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
-    found = np.full(
+    maxima = np.full(
         (len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0
     )
     for k, output in enumerate(outputs):
         error = max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         speed = max(map(abs, output.qd))
         n = k * BUCKETS_PER_S // rate_hz
-        found[n] = np.maximum(found[n], (error, speed))
-    return found
+        maxima[n] = np.maximum(maxima[n], (error, speed))
+    return maxima
 
 
 def agree(scenario: Scenario) -> None:
@@ -81,8 +81,8 @@ def agree(scenario: Scenario) -> None:
     for record, outputs in zip(fused.records, expected.values(), strict=True):
         last = floats(outputs[-1])
         np.testing.assert_array_equal(record[: len(last)], last)
-    for found, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
-        np.testing.assert_array_equal(found, buckets(outputs, scenario.sites[name].rate_hz))
+    for maximum, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
+        np.testing.assert_array_equal(maximum, buckets(outputs, scenario.sites[name].rate_hz))
     stops = [
         o.t_ns * 1e-9
         for outputs in expected.values()
@@ -166,13 +166,13 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     fused.advance_to(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
     whole = {
-        one.key: compute_log_metrics(log).run_value(one).value
-        for one in quantities()
-        if one.key in TOTALS
+        quantity.key: compute_log_metrics(log).run_value(quantity).value
+        for quantity in quantities()
+        if quantity.key in TOTALS
     }
-    found = fused.totals._asdict()
+    totals = fused.totals._asdict()
     for key in TOTALS:
-        assert found[key] == (
+        assert totals[key] == (
             whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)
         ), key
     squares = []
@@ -181,7 +181,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
         outer = 9.81 * theta[4] * np.cos(q[:, 0] + q[:, 1])
         gravity = np.stack((9.81 * theta[3] * np.cos(q[:, 0]) + outer, outer), axis=1)
         squares.append(np.mean((tau - gravity) ** 2))
-    assert found["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
+    assert totals["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
 
 
 @pytest.mark.long
@@ -189,14 +189,14 @@ def test_settling_is_the_last_error_limit_crossing() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
     fused = FusedRun(scenario, settled_rad=0.01)
     fused.advance_to(13.0)
-    apart = [
+    late_times_s = [
         output.t_ns
         for outputs in per_tick(scenario).values()
         for output in outputs
         if max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         >= 0.01
     ]
-    assert fused.settled_s == max(apart) / 1e9
+    assert fused.settled_s == max(late_times_s) / 1e9
     early = FusedRun(scenario, settled_rad=0.01)
     early.advance_to(2.0)
     assert early.settled_s is None

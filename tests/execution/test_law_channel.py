@@ -45,10 +45,12 @@ def test_peers_get_own_and_common_vectors() -> None:
                 10.0 * alpha[site].get(peer, 0.0) * ((heard - log[site].q) ** 2).sum(axis=1)
             )
         assert log[site].sent["energy"][:, 0] == pytest.approx(energy, rel=1e-12)
-        told = [log[site].sent[f"target[{peer}]"] - log[site].q for peer in log[site].peers]
+        differences = [
+            log[site].sent[f"target[{peer}]"] - log[site].q for peer in log[site].peers
+        ]
         # the same for both joints
-        assert all(np.ptp(one, axis=1).max() < 1e-12 for one in told)
-        assert np.abs(told[0] - told[1]).min() > 5e-3  # and other for each peer
+        assert all(np.ptp(difference, axis=1).max() < 1e-12 for difference in differences)
+        assert np.abs(differences[0] - differences[1]).min() > 5e-3  # and other for each peer
 
 
 def test_messages_are_executed_again_like_virtual_time() -> None:
@@ -122,16 +124,20 @@ def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
         for topic, one in channels.items()
         if "/viz/m2/" in topic
     }
-    sent = {name: one["unit"] for name, one in about.items() if name.startswith("sent_")}
+    sent = {
+        name: entry_of_file["unit"]
+        for name, entry_of_file in about.items()
+        if name.startswith("sent_")
+    }
     assert sent == {"sent_energy": "J", "sent_target_to_m1": "rad", "sent_target_to_s": "rad"}
     log = open_log(path)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        shown = [
-            [*one[3].data]
-            for one in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])
+        vectors = [
+            [*message[3].data]
+            for message in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])
         ]
-    assert shown == log["m2"].sent["target[s]"].tolist()
+    assert vectors == log["m2"].sent["target[s]"].tolist()
     page = build_plot_layout(channels).pages["Sent by laws"]
     assert [plot.title for plot in page[0]] == [
         f"{site}: energy that the law sends to all (J)" for site in SITES

@@ -76,11 +76,13 @@ def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
     torque = np.abs(part.tau_x).max(axis=1)
     assert not torque[grip == 0.0].any()
     assert part.t_s[grip > 0.0].max() == pytest.approx(0.7 + 0.2 + 0.1, abs=0.03)
-    own = align_records(held_log)["m1"]
-    split = split_torque(own, held_log.scenario)
+    records = align_records(held_log)["m1"]
+    split = split_torque(records, held_log.scenario)
     source = held_log.scenario.sites["m1"].hands[0].actor
-    expected = compute_live_torque(source, own.hand, own.q, own.qd, split.end_effector)
-    assert expected == pytest.approx(-own.tau_x, abs=1e-9)
+    expected = compute_live_torque(
+        source, records.hand, records.q, records.qd, split.end_effector
+    )
+    assert expected == pytest.approx(-records.tau_x, abs=1e-9)
     assert split.operator == pytest.approx(expected, abs=1e-9)
 
 

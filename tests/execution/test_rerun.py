@@ -91,8 +91,10 @@ def test_a_changed_site_sees_recorded_samples() -> None:
     site = Site(load_scenario(log.scenario, changes).setup("s"))
     samples = [{state.tick: state for state in log[peer].states} for peer in site.peers]
     for state, made in zip(log["s"].states, again.after["s"].states, strict=True):
-        came = [Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx]
-        assert equal_record(made, site.step(TickInput(state.tick, came)), site.peers)
+        arrivals = [
+            Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx
+        ]
+        assert equal_record(made, site.step(TickInput(state.tick, arrivals)), site.peers)
     assert again.sites["s"].first is not None
     assert not again.identical
     assert not again.broken

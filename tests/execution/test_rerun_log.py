@@ -114,15 +114,15 @@ def test_older_logs_become_this_version() -> None:
 
 
 def test_reruns_can_be_rerun_within_limits(file: Path, tmp_path: Path) -> None:
-    made = tmp_path / "again.mcap"
-    rerun(file, ["s"], {"control.Kd": 5}).save(made)
-    again = rerun(made, ["s"])
+    log_path = tmp_path / "again.mcap"
+    rerun(file, ["s"], {"control.Kd": 5}).save(log_path)
+    again = rerun(log_path, ["s"])
     assert again.identical
-    other = rerun(made, ["m1"])  # met the s that was, and meets the one that is in the file
+    other = rerun(log_path, ["m1"])  # met the s that was, and meets the one that is in the file
     assert not other.identical
     assert not other.broken
     assert any("is itself a rerun" in note and "m1" in note for note in other.notes)
-    back = rerun(made, ["s"], {"control.Kd": 3})
+    back = rerun(log_path, ["s"], {"control.Kd": 3})
     assert list(back.after["s"].q[-1]) == list(open_log(file)["s"].q[-1])
 
 

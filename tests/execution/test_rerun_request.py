@@ -74,13 +74,13 @@ def test_differences_are_lines_of_the_executed_scenario(
 
 
 def test_copied_sites_keep_their_settings() -> None:
-    found = request_rerun(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
+    request = request_rerun(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
     original = opened(recorded("paper")).scenario
     for name in ("m1", "m2"):
-        assert found.scenario.sites[name] == original.sites[name]
-        assert found.scenario.links[f"s->{name}"] == original.links[f"s->{name}"]
-    assert found.scenario.sites["s"].arm.m2_kg == 2.0
-    assert {changed.key for changed in found.without_effect} >= {
+        assert request.scenario.sites[name] == original.sites[name]
+        assert request.scenario.links[f"s->{name}"] == original.links[f"s->{name}"]
+    assert request.scenario.sites["s"].arm.m2_kg == 2.0
+    assert {changed.key for changed in request.without_effect} >= {
         "sites.m1.control.Kd",
         "links.s->m2.delay_ms",
     }
@@ -92,8 +92,8 @@ def test_each_site_has_its_own_timeline() -> None:
         {"at_s": 0.02, "link": "s->m1", "to": {"delay_ms": 6.0}},
         {"at_s": 0.03, "dominance": "s", "to": {"m1": 1.0}},
     ]
-    found = request_rerun(["s"], {"timeline": timeline})
-    assert [(change.link, change.dominance) for change in found.scenario.timeline] == [
+    request = request_rerun(["s"], {"timeline": timeline})
+    assert [(change.link, change.dominance) for change in request.scenario.timeline] == [
         ("m1->s", ""),
         ("", "s"),
     ]

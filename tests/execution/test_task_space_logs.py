@@ -49,8 +49,8 @@ def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
         )
         assert not own["rms_error_rad"].applies
         assert own["unaccounted_j"].value < 1e-6
-    apart = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
-    assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= apart
+    distance = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
+    assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= distance
     assert {"tracking_errors", "settling", "phase"} <= set(list_drawable_figures(log))
 
 
@@ -91,6 +91,6 @@ def test_wall_forces_follow_the_shares() -> None:
     assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(
         -pair.pushed_nm, rel=1e-2
     )
-    entry = next(one for one in metrics.to_dict()["force_sharing"] if one["axis"] == "x")
+    entry = next(ratio for ratio in metrics.to_dict()["force_sharing"] if ratio["axis"] == "x")
     assert entry["felt_n"] == pair.felt_nm
     assert "felt_nm" not in entry

@@ -96,12 +96,12 @@ def test_dying_differences_end_or_are_repeated() -> None:
 def test_a_twin_beyond_its_limits_is_reported() -> None:
     """The run itself stays within the limits; a twin with a large enough push does not."""
     log = tn.simulate("paper", {"limits.qd_limit_rad_s": 1.2}, duration_s=10)
-    found = tn.twin(log, 1, {"m1.q1": 0.9, "q": 1e-3})
-    far, near = found.growth.pushes
+    twin_report = tn.twin(log, 1, {"m1.q1": 0.9, "q": 1e-3})
+    far, near = twin_report.growth.pushes
     assert log.diverged_s is None
     assert far.ended_s is not None
     assert 1.0 < far.ended_s < 2.0
-    assert "makes the run diverge in " in found.describe(far)
+    assert "makes the run diverge in " in twin_report.describe(far)
     assert near.ended_s is None
 
 

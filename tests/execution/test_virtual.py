@@ -49,8 +49,8 @@ def test_sites_step_by_time_then_scenario_order(rate_hz: Rates) -> None:
     ]
     assert ran == sorted(ran)
     for index, name in enumerate(scenario.names):
-        made = [tick for _, i, tick in ran if i == index]
-        assert made == list(range(scenario.ticks(name)))
+        ticks = [tick for _, i, tick in ran if i == index]
+        assert ticks == list(range(scenario.ticks(name)))
         assert scenario.ticks(name) == max(1, round(Fraction(1, 10) * rate_hz[index]))
 
 

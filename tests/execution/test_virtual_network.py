@@ -134,10 +134,15 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
 def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
     deliveries = read_deliveries(short(steady(ticks)))
-    there = retime_deliveries(deliveries, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
-    assert there.last == 119 * rate_hz // 1000
+    later_deliveries = retime_deliveries(
+        deliveries, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000]
+    )
+    assert later_deliveries.last == 119 * rate_hz // 1000
     first = [
-        (k, m) for k in sorted(there.entries) for peer, m, _ in there.entries[k] if peer == 0
+        (k, m)
+        for k in sorted(later_deliveries.entries)
+        for peer, m, _ in later_deliveries.entries[k]
+        if peer == 0
     ]
     assert first
     assert [m for _, m in first] == list(range(len(first)))
@@ -159,4 +164,4 @@ def test_only_the_newest_assumed_samples_arrive() -> None:
     network = RecordedNetwork({"s": {9: [(0, tick, 0) for tick in ticks]}}, {"s": ["m1"]})
     for tick in ticks:
         network.send("m1", record(tick))
-    assert [one.tick for one in network.deliver("s", 9)] == [*ticks[5:]]
+    assert [arrival.tick for arrival in network.deliver("s", 9)] == [*ticks[5:]]

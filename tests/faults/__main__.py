@@ -44,12 +44,20 @@ class Seeds(NamedTuple):
 
     @property
     def failed(self) -> list[tuple[int, Judged]]:
-        return [(seed, one) for seed, one in enumerate(self.judged) if one.violations]
+        return [
+            (seed, judged_seed)
+            for seed, judged_seed in enumerate(self.judged)
+            if judged_seed.violations
+        ]
 
     def of(self, kind: str) -> list[Judged]:
         if kind == "several":
-            return [one for one in self.judged if len(one.faults) > 1]
-        return [one for one in self.judged if kind in {fault.kind for fault in one.faults}]
+            return [judged_seed for judged_seed in self.judged if len(judged_seed.faults) > 1]
+        return [
+            judged_seed
+            for judged_seed in self.judged
+            if kind in {fault.kind for fault in judged_seed.faults}
+        ]
 
 
 def judge_seeds(count: int, jobs: int | None) -> Seeds:
@@ -68,14 +76,14 @@ def find_tests(wanted: Sequence[str]) -> list[str]:
         path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
         for path in (ROOT / LIVE).glob("test_*.py")
     }
-    found = []
+    names = []
     for name in wanted:
         if "/" in name:
-            found.append(name)
+            names.append(name)
             continue
         (file,) = (file for file, text in files.items() if f"def test_{name}(" in text)
-        found.append(f"{file}::test_{name}")
-    return found
+        names.append(f"{file}::test_{name}")
+    return names
 
 
 def run_tests(names: Sequence[str]) -> dict[str, str]:
@@ -122,7 +130,7 @@ class Evidence(NamedTuple):
 
 
 def find_evidence(row: Row, seeds: Seeds, ends: dict[str, str]) -> Evidence:
-    sessions = [one for kind in row.kinds for one in seeds.of(kind)]
+    sessions = [judged_seed for kind in row.kinds for judged_seed in seeds.of(kind)]
     broken = sum(bool(session.violations) for session in sessions)
     names = find_tests((*row.virtual, *row.real))
     results = {name: ends.get(name, "not run") for name in names}
@@ -150,7 +158,7 @@ def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]
 
 
 def describe_seeds(seeds: Seeds) -> list[str]:
-    holds = [ticks for one in seeds.judged for ticks in one.holds]
+    holds = [ticks for judged_seed in seeds.judged for ticks in judged_seed.holds]
     each_s = seeds.took_s / len(seeds.judged)
     count, broken, most = len(seeds.judged), len(seeds.failed), max(holds, default=0)
     return [
@@ -162,7 +170,9 @@ def describe_seeds(seeds: Seeds) -> list[str]:
 
 def count_visits(seeds: Seeds) -> list[tuple[str, int]]:
     """Returns what sessions came by (modes, events, faults, what was dropped), each with its count."""
-    visited: Counter[str] = sum((one.visited for one in seeds.judged), Counter())
+    visited: Counter[str] = sum(
+        (judged_seed.visited for judged_seed in seeds.judged), Counter()
+    )
     return sorted(visited.items())
 
 
@@ -218,8 +228,8 @@ def main() -> int:
         TORQUES.write_text(torques + "\n", "utf-8")
         text = PAGE.read_text("utf-8")
         before, _, rest = text.partition(BEGIN)
-        made = "\n".join([BEGIN, "", *lines, "", END])
-        PAGE.write_text(before + made + rest.partition(END)[2], "utf-8")
+        block = "\n".join([BEGIN, "", *lines, "", END])
+        PAGE.write_text(before + block + rest.partition(END)[2], "utf-8")
         print("\n".join(" | ".join(describe_row(one)) for one in found if not one.holds))
     return int(bool(seeds.failed))
 

@@ -173,10 +173,13 @@ def storm_of(fault: Fault) -> list[tuple[float, str, ChangeRequest]]:
     for _ in range(max(2, round(STORM_ORDERS * lasts_s / STORM_S))):
         site = _a_site(rng)
         if rng.random() < 0.8:
-            asked: tuple[str, ChangeRequest] = (*site, ChangeRequest(order=rng.choice(LATCHES)))
+            request: tuple[str, ChangeRequest] = (
+                *site,
+                ChangeRequest(order=rng.choice(LATCHES)),
+            )
         else:
-            asked = order_of(Fault("order", 0.0, 0.0, site, rng.random()))
-        orders.append((rng.uniform(0.0, lasts_s), *asked))
+            request = order_of(Fault("order", 0.0, 0.0, site, rng.random()))
+        orders.append((rng.uniform(0.0, lasts_s), *request))
     return sorted(orders, key=lambda order: order[0])
 
 

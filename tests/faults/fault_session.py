@@ -247,7 +247,7 @@ class FaultSession(Session):
         bus.close()
 
     def _replay(self, fault: Fault) -> None:
-        name = next(one for one in fault.of if one in SITES)
+        name = next(site for site in fault.of if site in SITES)
         self._publish(topics.key(SESSION, name, topics.SAMPLE), self._recent[name][-600:-100:5])
 
     def _stranger(self, fault: Fault) -> None:

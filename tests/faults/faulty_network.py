@@ -107,9 +107,9 @@ class FaultyNetwork(LocalNetwork):
         if often and way.loss and chance.random() < way.loss:
             return
         if often and way.wrong and chance.random() < way.wrong:
-            place = chance.randrange(len(payload))
-            flipped = bytes([payload[place] ^ (1 << chance.randrange(8))])
-            payload = payload[:place] + flipped + payload[place + 1 :]
+            index = chance.randrange(len(payload))
+            flipped = bytes([payload[index] ^ (1 << chance.randrange(8))])
+            payload = payload[:index] + flipped + payload[index + 1 :]
         for _ in range(2 if way.doubled and chance.random() < way.doubled else 1):
             late_ns = way.delay_ns + (chance.randrange(way.jitter_ns) if way.jitter_ns else 0)
             if late_ns:
@@ -157,7 +157,7 @@ class FaultyNetwork(LocalNetwork):
         self._tell_presence(now - known, receiver, True)
 
     def _tokens_of(self, sender: str) -> frozenset[str]:
-        return frozenset(token for one in self._named(sender) for token in one._tokens)
+        return frozenset(token for member in self._named(sender) for token in member._tokens)
 
     def _tell_presence(self, tokens: frozenset[str], receiver: str, alive: bool) -> None:
         for token in sorted(tokens):

@@ -258,8 +258,8 @@ def check_log(session: FaultSession) -> Iterator[str]:
         return
     touched = any("recorder" in fault.of or fault.kind == "cut all" for fault in session.faults)
     for name in session.published.states:
-        there = set(log[name].tick.tolist())
-        lost = len(find_heard(session.published, name, there) - there)
+        recorded_ticks = set(log[name].tick.tolist())
+        lost = len(find_heard(session.published, name, recorded_ticks) - recorded_ticks)
         if lost != log.missing(name) or (lost and not touched):
             yield f"{name}: {lost} records are not in the log, which counts {log.missing(name)}"
 
@@ -274,7 +274,7 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
     starts = list(stretches(published.states[name]))
     heard = {state.tick for state in starts[-1]}
     for start, following in pairwise(starts):
-        came = [start[0].tick - 1]
+        newest_ticks = [start[0].tick - 1]
         for other, states in published.states.items():
             place = (
                 [peer for peer in published.states if peer != other].index(name)
@@ -283,10 +283,10 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
             )
             for stretch in stretches(states) if other != name else ():
                 if stretch[-1].tick >= following[0].tick:
-                    came += [
+                    newest_ticks += [
                         tick for state in stretch for peer, tick, _ in state.rx if peer == place
                     ]
-        newest = max(tick for tick in came if tick <= start[-1].tick)
+        newest = max(tick for tick in newest_ticks if tick <= start[-1].tick)
         last = max((tick for tick in there if tick <= newest), default=-1)
         newest = last if newest - last <= SILENT_TICKS else newest
         heard |= {state.tick for state in start if state.tick <= newest}
@@ -298,14 +298,14 @@ TELEMETRY = {"late_us": 0, "busy_us": 0, "sent_ns": 0, "echo": []}
 
 
 def find_altered(published: Sequence[State], there: Sequence[State]) -> list[int]:
-    made = {state.tick: state for state in published}
-    others = [state for state in there if made.get(state.tick) != state]
+    records = {state.tick: state for state in published}
+    others = [state for state in there if records.get(state.tick) != state]
     same = msgspec.structs.replace
     return [
         state.tick
         for state in others
-        if state.tick not in made
-        or same(state, **TELEMETRY) != same(made[state.tick], **TELEMETRY)
+        if state.tick not in records
+        or same(state, **TELEMETRY) != same(records[state.tick], **TELEMETRY)
     ]
 
 

@@ -50,10 +50,10 @@ class Judged(NamedTuple):
     rises_j: tuple[float, float]
 
     def __str__(self) -> str:
-        found = [
+        lines = [
             f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]
         ]
-        return "\n".join([f"  {self.arms}", describe(self.faults), *found])
+        return "\n".join([f"  {self.arms}", describe(self.faults), *lines])
 
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
@@ -83,8 +83,10 @@ def judge_faults(
     with collector_at_rest():
         with tempfile.TemporaryDirectory() as folder:
             session = run_faults(faults, Path(folder), seed, timetable, arms)
-            found = {name: list(check(session)) for name, check in INVARIANTS.items()}
-            found[TORQUE] = list(check_torque(session, undisturbed_nm))
+            violations_by_name = {
+                name: list(check(session)) for name, check in INVARIANTS.items()
+            }
+            violations_by_name[TORQUE] = list(check_torque(session, undisturbed_nm))
             digest = digest_session(session)
         if again:
             with tempfile.TemporaryDirectory() as folder:
@@ -92,8 +94,10 @@ def judge_faults(
                     digest_session(run_faults(faults, Path(folder), seed, timetable, arms))
                     != digest
                 ):
-                    found[AGAIN] = ["the same seed publishes or records other bytes"]
-        violations = {name: texts for name, texts in found.items() if texts}
+                    violations_by_name[AGAIN] = [
+                        "the same seed publishes or records other bytes"
+                    ]
+        violations = {name: texts for name, texts in violations_by_name.items() if texts}
         rises_j = [rises for _, rises in find_rises(session)] or [(-math.inf, -math.inf)]
         return Judged(
             faults,

@@ -114,8 +114,8 @@ def find_limited_ticks(scenario: Scenario, name: str, states: Sequence[State]) -
     # of a fast arm the torque is not that of its law
     qd = np.array([state.qd for state in states])
     limited |= np.any(np.abs(qd) * setup.rest.damping > setup.tau_limit_nm, axis=1)
-    found: np.ndarray = limited | np.r_[False, limited[:-1]]
-    return found
+    limited_ticks: np.ndarray = limited | np.r_[False, limited[:-1]]
+    return limited_ticks
 
 
 def check_storage(session: FaultSession) -> Iterator[str]:
@@ -314,8 +314,8 @@ def _find_unbalanced(scenario: Scenario, rest: Rest) -> np.ndarray:
     q, v = (rest.rows(key)[: rest.blend + 1] for key in ("q", "qd"))
     a = np.diff(v, axis=0) * rest.setup.rate_hz
     torque = np.abs(_multiply_inertia(scenario.arms[rest.name].theta, q[1:], a))
-    found: np.ndarray = torque.max(axis=0, initial=0.0)
-    return found
+    largest_nm: np.ndarray = torque.max(axis=0, initial=0.0)
+    return largest_nm
 
 
 def check_rest(session: FaultSession) -> Iterator[str]:

@@ -85,9 +85,9 @@ class Party:
 
     def elsewhere(self, ahead_ns: int, unix_ns: int = 0, name: str = "elsewhere") -> Elsewhere:
         """Returns the clock of another machine, which advances like the one here."""
-        made = Elsewhere(self.clock.monotonic_ns() + ahead_ns, unix_ns, name)
-        self._clocks.append(made)
-        return made
+        clock = Elsewhere(self.clock.monotonic_ns() + ahead_ns, unix_ns, name)
+        self._clocks.append(clock)
+        return clock
 
     def member(self, name: str, **facts: object) -> Member:
         self._boot += 1

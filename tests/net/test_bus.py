@@ -174,8 +174,8 @@ def test_responders_answer_at_once_without_polling(pair: tuple[Bus, Bus]) -> Non
 
 def test_silent_responders_let_others_be_heard(network: Network) -> None:
     asker, silent, other = (network.join() for _ in range(3))
-    asked: list[bytes] = []
-    silent.respond("t/a/ping", asked.append)
+    questions: list[bytes] = []
+    silent.respond("t/a/ping", questions.append)
     other.respond("t/b/ping", lambda _: b"here")
     heard: list[tuple[str, bytes]] = []
     pending: list[Inbox] = []
@@ -184,10 +184,10 @@ def test_silent_responders_let_others_be_heard(network: Network) -> None:
         pending.append(asker.query("t/*/ping", b"?"))
         for replies in pending:
             heard.extend(drained(replies))
-        return bool(asked and heard)
+        return bool(questions and heard)
 
     until(both)
-    assert set(asked) == {b"?"}
+    assert set(questions) == {b"?"}
     assert set(heard) == {("t/b/ping", b"here")}
 
 

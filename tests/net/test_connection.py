@@ -143,8 +143,8 @@ def router(
 
 def test_routers_listen_and_connect_as_configured() -> None:
     assert router(None, None, None) == Connection(HERE, (), "router", {})
-    told = router([A], [B], file(mode="router"))
-    assert told == Connection([A], [B], "router", {})
+    lines = router([A], [B], file(mode="router"))
+    assert lines == Connection([A], [B], "router", {})
     places = {"router": [C], "peer": [B]}
     assert router(None, None, file(listen={"endpoints": places})).listen == [C]
     for mode in ("peer", "client"):
@@ -274,8 +274,8 @@ def test_namesake_sessions_get_their_own_ports() -> None:
         ]
         places = list(chain.from_iterable(chosen))
         assert len(set(places)) == 9
-        for place in places:
-            stack.enter_context(closing(ZenohBus([place])))
+        for endpoint in places:
+            stack.enter_context(closing(ZenohBus([endpoint])))
 
 
 class Played(ManualClock):

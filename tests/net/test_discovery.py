@@ -118,9 +118,9 @@ def find(*payloads: bytes) -> list[Info]:
 
 
 def test_members_are_found_despite_unreadable_answers() -> None:
-    found = find(encode(answer_info("m0", 1)), b"garbage")
-    assert {info.member for info in found} == {"m0"}
-    assert len(found) >= 2
+    members = find(encode(answer_info("m0", 1)), b"garbage")
+    assert {info.member for info in members} == {"m0"}
+    assert len(members) >= 2
     assert find() == []
 
 

@@ -34,14 +34,19 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_running_sites_are_known_to_their_user(state: Path) -> None:
     assert find_known_sites("t") == []
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
-        (one,) = find_known_sites("t")
-        assert (one.site, tuple(one.sites), one.stop, one.keyed) == (
+        (known_site,) = find_known_sites("t")
+        assert (
+            known_site.site,
+            tuple(known_site.sites),
+            known_site.stop,
+            known_site.keyed,
+        ) == (
             "s",
             SITES,
             b"order",
             False,
         )
-        assert one.places == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
+        assert known_site.places == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
         assert find_known_sites("another") == []
         (file,) = state.iterdir()
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -51,13 +56,13 @@ def test_running_sites_are_known_to_their_user(state: Path) -> None:
 
 def test_dead_processes_and_machines_count_nothing(state: Path) -> None:
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
-        (one,) = find_known_sites("t")
+        (known_site,) = find_known_sites("t")
     gone = subprocess.Popen([sys.executable, "-S", "-c", ""])
     gone.wait()
     for n, stale in enumerate(
         (
-            msgspec.structs.replace(one, pid=gone.pid),
-            msgspec.structs.replace(one, machine=f"not {SystemClock().identity()}"),
+            msgspec.structs.replace(known_site, pid=gone.pid),
+            msgspec.structs.replace(known_site, machine=f"not {SystemClock().identity()}"),
         )
     ):
         (state / f"{n}.json").write_bytes(msgspec.json.encode(stale))

@@ -119,15 +119,15 @@ def key(member: str, channel: str) -> str:
 
 
 def exchange_messages(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
-    came: list[tuple[str, bytes]] = []
+    messages: list[tuple[str, bytes]] = []
 
     def there() -> bool:
         say(b"true")
-        came.extend(drained(inbox))
-        return any(payload == b"true" for _, payload in came)
+        messages.extend(drained(inbox))
+        return any(payload == b"true" for _, payload in messages)
 
     until(there)
-    return came
+    return messages
 
 
 def test_members_speak_under_their_own_name_only(meeting: Meeting, folder: Path) -> None:
@@ -241,10 +241,12 @@ def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> 
     (tmp_path / PRIVATE_KEY).chmod(0o600)
     listed = [name for name in ALL if name != "s"]
     (tmp_path / MEMBERS).write_text(json.dumps({"member": "m1", "members": listed}))
-    (place,) = (free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1))
-    m1 = ZenohBus([place], settings=read_member_keys(tmp_path).settings)
+    (endpoint,) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
+    )
+    m1 = ZenohBus([endpoint], settings=read_member_keys(tmp_path).settings)
     others = {
-        name: ZenohBus([], [place], settings=read_member_keys(folder / name).settings)
+        name: ZenohBus([], [endpoint], settings=read_member_keys(folder / name).settings)
         for name in ("s", "m2")
     }
     try:
@@ -293,14 +295,14 @@ def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
             meeting.join(lawless(read_member_keys(foreign / "m2")))
     else:
         stranger.publisher(key("m2", topics.EVENT))(b"forged")
-    came = exchange_messages(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
-    assert {payload for _, payload in came} == {b"true"}
+    messages = exchange_messages(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
+    assert {payload for _, payload in messages} == {b"true"}
 
 
 def test_flipped_bits_end_connections_which_return(folder: Path) -> None:
     """TLS finds the bit: no payload arrives changed, even if Zenoh dies of the error."""
-    words = [sys.executable, "-m", "tests.net.flipped_bit", str(folder)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    command = [sys.executable, "-m", "tests.net.flipped_bit", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert set(done.stdout.split()) <= {"true", "again"}
     if done.returncode in (-signal.SIGABRT, -signal.SIGSEGV):
         pytest.xfail(
@@ -380,12 +382,12 @@ def test_without_keys_nobody_listens_on_a_network(listen: str, open_: bool) -> N
 
 
 def test_own_mutual_tls_equals_keys() -> None:
-    own = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
-    safe = Connection(["tls/192.0.2.1:7447"], settings=own)
+    settings = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
+    safe = Connection(["tls/192.0.2.1:7447"], settings=settings)
     assert secure_connection(safe, None, insecure=False) == safe
     with pytest.raises(UsageError, match="insecure=True"):
         secure_connection(
-            Connection(["tcp/192.0.2.1:7447"], settings=own), None, insecure=False
+            Connection(["tcp/192.0.2.1:7447"], settings=settings), None, insecure=False
         )
 
 
@@ -422,7 +424,9 @@ def test_every_rule_names_members_and_denies_others() -> None:
         if rule["flows"] == ["ingress"] and rule["messages"] == ["put"]
     }
     for site in SITES:
-        assert {topics.parse_key(one).member for one in says[site]} == {site}  # type: ignore[union-attr]
+        assert {topics.parse_key(key_expression).member for key_expression in says[site]} == {
+            site
+        }  # type: ignore[union-attr]
     assert says[OPERATOR] == {
         topics.key("*", "*", channel) for channel in ROLES[OPERATOR].publishes_to
     }
@@ -476,13 +480,13 @@ def make_ending_keys(
 def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus, ZenohBus]]:
     """Connects the sites m1, which listens, and s."""
     (place,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
-    own = {
+    settings = {
         member: read_member_keys(folder / member, stops=stops).settings
         for member in ("m1", "s")
     }
     with (
-        closing(ZenohBus([place], settings=own["m1"])) as site,
-        closing(ZenohBus([], [place], settings=own["s"])) as peer,
+        closing(ZenohBus([place], settings=settings["m1"])) as site,
+        closing(ZenohBus([], [place], settings=settings["s"])) as peer,
     ):
         yield site, peer
 

@@ -67,13 +67,13 @@ def test_one_exchange_gives_the_classical_offset(
     drift besides.
     """
     sent = ceiling(other, 0, there_ns)
-    came = floor(other, there_ns, back_ns)
+    bound = floor(other, there_ns, back_ns)
     estimator = OffsetEstimator()
-    estimator.add(sent, came)
+    estimator.add(sent, bound)
     estimate = estimator.estimate(there_ns + back_ns)
     assert estimate is not None
     trip_ns = there_ns + back_ns
-    classical = (sent.offset_ns + came.offset_ns) / 2
+    classical = (sent.offset_ns + bound.offset_ns) / 2
     spread_ns = 600e-6 * trip_ns + 2
     assert abs(estimate.offset_ns - classical) <= spread_ns
     bound_ns = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)

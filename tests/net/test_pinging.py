@@ -126,9 +126,9 @@ def test_pings_slow_down_once_all_are_known() -> None:
     assert not world.pinger.knows_clocks([5])
     world.wait(200_000_000, 5, 7)
     assert world.pinger.knows_clocks([5, 7])
-    asked = world.bus.asked
+    requests = world.bus.asked
     world.wait(5 * S, 5, 7)
-    assert world.bus.asked - asked == pytest.approx(5 * S / PING_REST_NS, abs=1)
+    assert world.bus.asked - requests == pytest.approx(5 * S / PING_REST_NS, abs=1)
 
 
 def test_without_other_clocks_nobody_is_asked() -> None:

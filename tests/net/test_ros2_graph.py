@@ -231,13 +231,13 @@ class Wire:
 
     def hears(self, key: str) -> list[bytes]:
         """Returns the stranger's messages from now on, and of a latched topic also the earlier ones."""
-        came: list[bytes] = []
+        payloads: list[bytes] = []
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-        take = lambda sample: came.append(sample.payload.to_bytes())  # noqa: E731
+        take = lambda sample: payloads.append(sample.payload.to_bytes())  # noqa: E731
         self._kept.append(
             zenoh.ext.declare_advanced_subscriber(self.stranger, key, take, history=history)
         )
-        return came
+        return payloads
 
     def close(self) -> None:
         self.graph.__exit__()
@@ -260,8 +260,8 @@ SENT = Attachment(1, 5, b"s" * 16)
 
 
 def test_messages_of_other_types_are_refused(wire: Wire) -> None:
-    came: list[tuple[bytes, Attachment]] = []
-    wire.graph.subscribe("a", STRING, lambda data, sent: came.append((data, sent)))
+    messages: list[tuple[bytes, Attachment]] = []
+    wire.graph.subscribe("a", STRING, lambda data, sent: messages.append((data, sent)))
     right = topic_key(0, "a", STRING, STRING_HASH)
     for attachment in (None, b"", b"x" * 33):
         wire.say(right, b"bare", attachment)
@@ -271,22 +271,22 @@ def test_messages_of_other_types_are_refused(wire: Wire) -> None:
         )
     wire.say(topic_key(0, "a", STRING, "TypeHashNotSupported"), b"humble", SENT.encode())
     wire.say(right, b"jazzy", SENT.encode())
-    until(lambda: len(came) == 2)
-    assert came == [(b"humble", SENT), (b"jazzy", SENT)]
+    until(lambda: len(messages) == 2)
+    assert messages == [(b"humble", SENT), (b"jazzy", SENT)]
     assert wire.graph.refusals.counts == {"a: a message without an attachment of ROS": 3}
 
 
 def test_raising_messages_are_refused_without_effect(wire: Wire) -> None:
-    came: list[bytes] = []
+    payloads: list[bytes] = []
 
     def take(data: bytes, _: Attachment) -> None:
-        came.append(data)
+        payloads.append(data)
         raise ValueError("is none")
 
     wire.graph.subscribe("a", STRING, take)
     for data in (b"1", b"2"):
         wire.say(topic_key(0, "a", STRING, STRING_HASH), data, SENT.encode())
-    until(lambda: len(came) == 2)
+    until(lambda: len(payloads) == 2)
     until(lambda: wire.graph.refusals.counts == {"a is none": 2})
     assert wire.said == ["refused: a is none"]
 
@@ -349,12 +349,12 @@ def test_returning_routers_carry_every_topic_again(wire: Wire) -> None:
 
 
 def test_peers_forward_nothing_and_name_the_cure() -> None:
-    (place,) = find_free_endpoints(1)
+    (endpoint,) = find_free_endpoints(1)
     with (
-        closing(opened("peer", place)),
+        closing(opened("peer", endpoint)),
         pytest.raises(UsageError, match=r"is not a router.*rmw_zenohd"),
     ):
-        Ros2Graph(Refusals(print), [place], "play", "trilat", SystemClock())
+        Ros2Graph(Refusals(print), [endpoint], "play", "trilat", SystemClock())
 
 
 def test_an_absent_router_is_silent() -> None:

@@ -151,15 +151,15 @@ def test_logged_figures_are_true() -> None:
     session = Session(((0, 0), (3 * S, 100_000)), (LAN, LAN))
     session.run(12.0)
     site, start_ns = session.sites[0], 10**12
-    told = [news for news in site.news if news["kind"] == "clock"]
-    assert len(told) >= 12
-    for news in told:
+    clock_events = [news for news in site.news if news["kind"] == "clock"]
+    assert len(clock_events) >= 12
+    for news in clock_events:
         assert news["about"] == "b"
         at_ns = start_ns + S + news["ticks"] * S // RATE_HZ
         truth = 3 * S + (at_ns - start_ns) // 10_000
         assert abs(news["offset_ns"] - truth) <= news["bound_ns"] + 50
         assert abs(news["drift_ppb"] - 100_000) <= news["drift_bound_ppb"]
-    last = told[-1]
+    last = clock_events[-1]
     assert abs(last["drift_ppb"] - 100_000) <= 5_000
     assert "offset 3.00" in last["text"]
     assert "ppm" in last["text"]
@@ -279,11 +279,11 @@ def test_members_on_the_leaders_clock_need_no_steering() -> None:
 
 @given(st.integers(1, 30), st.integers(1, 4000))
 def test_turns_lie_within_half_a_period(sites: int, rate_hz: int) -> None:
-    turns = [find_turn_ns(place, sites, rate_hz) for place in range(sites)]
+    turns = [find_turn_ns(index, sites, rate_hz) for index in range(sites)]
     assert turns[0] == 0
     assert 2 * turns[-1] * rate_hz < S
-    apart = [later - turn for turn, later in pairwise(turns)]
-    assert max(apart, default=0) - min(apart, default=0) <= 1
+    intervals = [later - turn for turn, later in pairwise(turns)]
+    assert max(intervals, default=0) - min(intervals, default=0) <= 1
 
 
 EPOCH_NS = 5_000_000_123

@@ -406,7 +406,7 @@ def test_events_return(kind: str, text: str, boot: int, others: dict[str, int]) 
     tick=ticks,
 )
 def test_statistics_and_infos_return(counts: dict[str, int], boot: int, tick: int) -> None:
-    own = {"v": VERSION, "site": "m1", "boot": boot, "tick": tick, "t_ns": 5, "mode": "run"}
+    facts = {"v": VERSION, "site": "m1", "boot": boot, "tick": tick, "t_ns": 5, "mode": "run"}
     each = (
         "age_us",
         "accepted",
@@ -424,7 +424,7 @@ def test_statistics_and_infos_return(counts: dict[str, int], boot: int, tick: in
         "grid_error_us": -4,
         "slew_ppb": 5,
     }
-    stats = LinkStats(**own, **dict.fromkeys((*each, "delay_us"), counts), **whole)
+    stats = LinkStats(**facts, **dict.fromkeys((*each, "delay_us"), counts), **whole)
     assert decode(encode(stats), LinkStats) == stats
     info = answer_info("s", boot)
     assert decode(encode(info), Info) == info

@@ -206,8 +206,8 @@ def test_connected_routers_are_one_network() -> None:
 
 def test_members_meet_at_a_private_socket(tmp_path: Path) -> None:
     """A Unix socket in a folder that no other user may enter, in place of a port of loopback."""
-    place = f"unixsock-stream/{tmp_path}/m1.sock"
-    with closing(ZenohBus([place])) as site, closing(ZenohBus([], [place])) as peer:
+    endpoint = f"unixsock-stream/{tmp_path}/m1.sock"
+    with closing(ZenohBus([endpoint])) as site, closing(ZenohBus([], [endpoint])) as peer:
         inbox, publish = peer.inbox("trilat/x/m1/event"), site.publisher("trilat/x/m1/event")
 
         def arrived() -> bool:
@@ -215,4 +215,4 @@ def test_members_meet_at_a_private_socket(tmp_path: Path) -> None:
             return inbox.poll() is not None
 
         until(arrived)
-    assert is_loopback(place)
+    assert is_loopback(endpoint)

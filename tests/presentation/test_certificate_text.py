@@ -179,9 +179,9 @@ def test_many_links_are_one_entry() -> None:
 
 
 def test_wrong_weights_of_the_paper_are_named() -> None:
-    told = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
-    assert told.mark == "note"
-    assert told.text.startswith(
+    last_line = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
+    assert last_line.mark == "note"
+    assert last_line.text.startswith(
         "with the paper's weights, ones, V would have risen by 12.3 J of 32.8"
     )
     assert (

@@ -84,11 +84,11 @@ def test_every_joint_has_its_panel(form, draw, panels):
     figure = draw(six(), form)
     assert panels in (None, len(figure.axes))
     assert misplaced(figure) == []
-    words = " ".join(
+    text = " ".join(
         axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes
     )
     if panels in (6, 7):
-        assert all(f"{n}: {name}" in words for n, name in enumerate(JOINTS, 1))
+        assert all(f"{n}: {name}" in text for n, name in enumerate(JOINTS, 1))
 
 
 def test_tip_paths_appear_in_three_planes():

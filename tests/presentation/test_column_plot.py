@@ -88,10 +88,10 @@ def test_sites_joints_and_times_restrict_a_figure():
 def test_modes_are_steps_between_words():
     log = logs.busy().log
     [axes] = log.plot("mode").axes
-    words = [label.get_text() for label in axes.get_yticklabels()]
+    labels = [label.get_text() for label in axes.get_yticklabels()]
     recorded = {mode for site in log.sites for mode in log[site].mode}
-    assert set(words) == recorded
-    assert words[0] == "run"
+    assert set(labels) == recorded
+    assert labels[0] == "run"
     assert {line.get_drawstyle() for line in curves(axes)} == {"steps-post"}
 
 

@@ -180,13 +180,13 @@ def list_ros_series(
     for site, motion in motions.items():
         for topic, truth in (("tip_pose", motion.turned), ("reference_pose", motion.reference)):
             messages = poses[f"{prefix}/{site}/{topic}"]
-            turns = np.array([read_turn(one.pose.orientation) for one in messages])
+            turns = np.array([read_turn(transform.pose.orientation) for transform in messages])
             yield f"{site} {topic}", turns, truth
     links = defaultdict(list)
     for message in frames:
-        for one in message.transforms:
-            links[one.header.frame_id, one.child_frame_id].append(
-                read_turn(one.transform.rotation)
+        for transform in message.transforms:
+            links[transform.header.frame_id, transform.child_frame_id].append(
+                read_turn(transform.transform.rotation)
             )
     for site, motion in motions.items():
         turned = [Rotation.identity(RECORDS), *place_links(log.scenario, site, motion.q)]
@@ -279,7 +279,7 @@ def test_bodies_on_pages_turn_with_the_plant(number: int) -> None:
     """A plant may give its quaternions any sign."""
     truth, bodies = turn(number), BodyTurns()
     canonical = truth.as_quat(canonical=True, scalar_first=True)
-    frames = [bodies.align([1.0, 2.0, 3.0, *one, 0.0, 0.0, 0.0, *-one]) for one in canonical]
+    frames = [bodies.align([1.0, 2.0, 3.0, *axis, 0.0, 0.0, 0.0, *-axis]) for axis in canonical]
     poses = np.array(frames).reshape(RECORDS, 2, 7)
     assert_follows("first body", poses[:, 0, 3:], truth, 1e-4)
     assert_follows("second body", poses[:, 1, 3:], truth, 1e-4)
@@ -302,7 +302,7 @@ def test_environments_observe_continuous_orientations() -> None:
     assert env.observation_space.contains(observed[-1])
     for what, column in (("q_des", 3), ("peer_q", 9)):
         vectors = np.array(shared)[:, column : column + 3]
-        series = np.array([one[what].ravel()[3:] for one in observed[1:]])
+        series = np.array([observation[what].ravel()[3:] for observation in observed[1:]])
         assert series.shape[1] == 6
         turned = Rotation.from_rotvec(vectors)
         assert count_wraps(turned) > 0

@@ -35,9 +35,9 @@ def log() -> Log:
     )
     stats = opened(recorded("two_sites", {"duration_s": 0.4})).link_stats("m")
     new = {"site": "a", "dropped": {"not finite": 3}, "offset_us": {"b": -4}}
-    told = [msgspec.structs.replace(statistics, **new) for statistics in stats]
+    statistics_list = [msgspec.structs.replace(statistics, **new) for statistics in stats]
     return logs.rewritten(
-        logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *told]
+        logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *statistics_list]
     )
 
 
@@ -165,7 +165,7 @@ def test_live_stamps_are_exact_in_matlab(tmp_path: Path) -> None:
 
 def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
     path, wanted = exported("ros2", tmp_path), expected()
-    found: dict[str, list[list[float]]] = {}
+    columns: dict[str, list[list[float]]] = {}
     with path.open("rb") as stream:
         for _, channel, message, decoded in make_reader(
             stream, decoder_factories=[DecoderFactory()]
@@ -173,7 +173,7 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
             topics=[f"/{log().session['session']}/{site}/joint_states" for site in "abc"]
         ):
             row = [*decoded.position, *decoded.velocity, *decoded.effort, message.publish_time]
-            found.setdefault(channel.topic.split("/")[2], []).append(row)
+            columns.setdefault(channel.topic.split("/")[2], []).append(row)
     names = (
         "q1_rad",
         "q2_rad",
@@ -185,7 +185,7 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
     )
     for site in "abc":
         rows = zip(*(wanted[f"{site}_state"][name] for name in names), strict=True)
-        assert found[site] == [list(row) for row in rows]
+        assert columns[site] == [list(row) for row in rows]
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])

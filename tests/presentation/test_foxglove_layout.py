@@ -23,14 +23,14 @@ LIVE_ONLY = {"link_delay", "link_offset", "timing"}
 
 def first_messages(file: Path) -> dict[str, object]:
     """Returns the first message of each topic that the schemas of the file can decode."""
-    found: dict[str, object] = {}
+    messages: dict[str, object] = {}
     with file.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
         topics = [c.topic for c in summary.channels.values() if c.message_encoding == "cdr"]
         for _, channel, _, message in reader.iter_decoded_messages(topics):
-            found.setdefault(channel.topic, message)
-    return found
+            messages.setdefault(channel.topic, message)
+    return messages
 
 
 def resolve(path: str, messages: Mapping[str, object]) -> object:

@@ -63,8 +63,8 @@ def read(folder: Path, place: str = "data") -> pl.DataFrame:
 
 
 def info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-    return found
+    facts: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    return facts
 
 
 def make_event(text: str, at_s: float, kind: str = "mark") -> Event:
@@ -133,10 +133,10 @@ def test_users_above_the_programs_share_intervene(tmp_path: Path) -> None:
     assert shares[135] == pytest.approx([0.7, 0.3])
     assert shares[-1] == pytest.approx([0.9, 0.1])
     assert frames["intervention"].to_list() == [n > 120 for n in range(180)]
-    led = np.where(
+    leader = np.where(
         frames["intervention"].to_numpy()[:, None], frames["action.a"], frames["action.b"]
     )
-    assert np.array_equal(frames["action"].to_numpy(), led)
+    assert np.array_equal(frames["action"].to_numpy(), leader)
 
 
 def test_a_named_program_replaces_the_default(tmp_path: Path) -> None:

@@ -41,11 +41,11 @@ def short_log() -> Log:
 
 def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certificate:
     """Returns a certificate of a run with a proof, with the given behaviour and error at its end."""
-    found = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
-    end = found.end._replace(
+    certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
+    end = certificate.end._replace(
         behaviour=behaviour, end_error_rad=error_rad, reasons=(), operator_acts=False
     )
-    return replace(found, **{"end": end, "roots": STABLE_ROOTS, **fields})
+    return replace(certificate, **{"end": end, "roots": STABLE_ROOTS, **fields})
 
 
 def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> str:
@@ -156,15 +156,15 @@ def test_key_numbers_have_place_and_time() -> None:
 def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = logs.simulated(name)
-    found = certify(log)
+    certificate = certify(log)
     error = find_last_error(log)
     assert error is not None
     facts = summarise_run(log)
-    assert facts["max_error_end_rad"] == found.end.end_error_rad == error.value
+    assert facts["max_error_end_rad"] == certificate.end.end_error_rad == error.value
     assert f"{error.value:.3g} rad in the last second, of {error.joint}" in render_key_numbers(
         log, facts
     )
-    assert f"largest |e| {error.value:.3g} rad of {error.joint} and" in found.end.text
+    assert f"largest |e| {error.value:.3g} rad of {error.joint} and" in certificate.end.text
     table = _tabulate_sites(log, is_timed=False)
     row = next(row for row in table.rows if row[0] == error.site)
     assert list(row[-2:]) == [f"{error.value:.3g}", error.joint.removeprefix(f"{error.site} ")]
@@ -183,15 +183,15 @@ def test_limits_stand_under_the_judgement() -> None:
     )
     remark = "m1 was at its torque limit for 0.15 s"
     assert remark not in certify_run(log, twins=0).remarks
-    found = certify_run(at_limit, twins=0)
-    assert found.remarks == (remark,)
-    assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, found, ())
+    certificate = certify_run(at_limit, twins=0)
+    assert certificate.remarks == (remark,)
+    assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, certificate, ())
     for brief in (True, False):
-        texts = [block.lines()[0] for block in compose(found, brief=brief)]
-        place = texts.index(f"note {remark}")
-        reasons = [line.text for line in describe_certificate(found)]
-        assert place in (1, 2)  # before the reasons
-        assert texts[place + 1].endswith(reasons[1])
+        texts = [block.lines()[0] for block in compose(certificate, brief=brief)]
+        line_index = texts.index(f"note {remark}")
+        reasons = [line.text for line in describe_certificate(certificate)]
+        assert line_index in (1, 2)  # before the reasons
+        assert texts[line_index + 1].endswith(reasons[1])
 
 
 def test_log_without_records_has_dashes() -> None:
@@ -202,10 +202,10 @@ def test_log_without_records_has_dashes() -> None:
 
 def test_end_errors_of_pushed_arms_are_marked() -> None:
     log = logs.simulated("paper")
-    words = "which a hand or a wall still pushes"
+    text = "which a hand or a wall still pushes"
     for torque_nm, is_pushed in ((1.0, True), (0.0, False)):
         run = logs.rewritten(
             log,
             change=lambda row, t=torque_nm: logs.replaced(row, tau_x=[t, 0.0]),  # type: ignore[misc]
         )
-        assert (words in render_key_numbers(run, summarise_run(run))) == is_pushed
+        assert (text in render_key_numbers(run, summarise_run(run))) == is_pushed

@@ -23,10 +23,10 @@ def test_rates_printing_differently_are_explained(
     rate_per_s = factor * certificate.twins.worst.rate_per_s
     roots = LoopRoots("stable", rate_per_s, exact, "this rest: stable")
     lines = describe_certificate(replace(certificate, roots=roots))
-    told = [line for line in lines if line.text.startswith("of the two rates")]
-    assert [line.mark for line in told] == ["note"] * remarks
+    lines_on_rates = [line for line in lines if line.text.startswith("of the two rates")]
+    assert [line.mark for line in lines_on_rates] == ["note"] * remarks
     accuracy = "roots is exact" if exact else "roots is an approximation"
-    assert all(accuracy in line.text and "is measured" in line.text for line in told)
+    assert all(accuracy in line.text and "is measured" in line.text for line in lines_on_rates)
 
 
 def test_inapplicable_theorems_have_not_passed() -> None:

@@ -66,13 +66,13 @@ def draw_example(name, width_in):
     ],
 )
 def test_words_have_8_pt_without_overlap(name, width_in):
-    made = draw_example(name, width_in)
-    assert made.get_figwidth() == width_in
-    assert misplaced(made) == []
-    assert {text.get_fontsize() for text in made.findobj(Text) if text.get_text().strip()} == {
-        8.0
-    }
-    for axes in made.axes:
+    figure_drawn = draw_example(name, width_in)
+    assert figure_drawn.get_figwidth() == width_in
+    assert misplaced(figure_drawn) == []
+    assert {
+        text.get_fontsize() for text in figure_drawn.findobj(Text) if text.get_text().strip()
+    } == {8.0}
+    for axes in figure_drawn.axes:
         spec = axes.get_subplotspec()
         below_it_is_the_same = len(axes.get_shared_x_axes().get_siblings(axes)) > 1
         if spec.is_last_row() or not below_it_is_the_same:

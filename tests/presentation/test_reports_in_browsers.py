@@ -203,9 +203,9 @@ def test_whole_report_with_its_certificate_is_drawn(
     certificate = certify(log)
     path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
     observed, twins = certificate.observed, certificate.twins
-    shown = [certificate.balance, observed and observed.curves, twins and twins.pushes]
+    sections = [certificate.balance, observed and observed.curves, twins and twins.pushes]
     with watched_page(browser, **SCREEN) as watched:
         watched.page.goto(path.as_uri())
         unfold(watched.page)
         watched.assert_whole()
-        assert watched.page.locator("img.picture").count() == sum(map(bool, shown))
+        assert watched.page.locator("img.picture").count() == sum(map(bool, sections))

@@ -113,7 +113,7 @@ def statistics(tick, **clock):
     none = {"m1": 0, "s": 0}
     counts = dict.fromkeys(("accepted", "late", "duplicate", "refused", "age_us"), none)
     zeros = dict.fromkeys(("late_max_us", "busy_max_us", "overruns"), 0)
-    place = {
+    facts = {
         "v": 2,
         "site": "m2",
         "boot": 1,
@@ -121,7 +121,7 @@ def statistics(tick, **clock):
         "t_ns": tick * 5_000_000,
         "mode": "run",
     }
-    return LinkStats(**place, **counts, **zeros, dropped={}, **clock)
+    return LinkStats(**facts, **counts, **zeros, dropped={}, **clock)
 
 
 def clocked():

@@ -71,7 +71,9 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
 
 def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
     site = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)["m"]
-    (table,) = (one for one in log().tables() if one.label == "m_state")
+    (table,) = (
+        table_of_site for table_of_site in log().tables() if table_of_site.label == "m_state"
+    )
     frame = to_data_frame(table)
     for field, heads in HEADS.items():
         wanted = getattr(log()["m"], field)
@@ -90,20 +92,20 @@ def list_numbers(message: Any) -> list[float]:
 
 def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
     path = exported("ros2", tmp_path)
-    found: dict[str, list[list[float]]] = {}
+    columns: dict[str, list[list[float]]] = {}
     with AnyReader([path]) as bag:
         for connection, _, data in bag.messages():
             if connection.topic.startswith("/planar/s/") and connection.msgtype.endswith(
                 "Float64MultiArray"
             ):
                 message = bag.deserialize(data, connection.msgtype)
-                found.setdefault(connection.topic, []).append(message.data.tolist())
+                columns.setdefault(connection.topic, []).append(message.data.tolist())
             if (
                 connection.topic.startswith("/planar/s/")
                 and "geometry_msgs" in connection.msgtype
             ):
                 message = bag.deserialize(data, connection.msgtype)
-                found.setdefault(connection.topic, []).append(list_numbers(message))
+                columns.setdefault(connection.topic, []).append(list_numbers(message))
         types = {connection.topic: connection.msgtype for connection in bag.connections}
     part = log()["s"]
     for topic, vectors in {
@@ -114,7 +116,7 @@ def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
         "tip_wrench": -part.wrench,
         "error": part.e,
     }.items():
-        assert np.array_equal([row[:3] for row in found[f"/planar/s/{topic}"]], vectors)
+        assert np.array_equal([row[:3] for row in columns[f"/planar/s/{topic}"]], vectors)
     assert types["/planar/s/joint_states"] == "sensor_msgs/msg/JointState"
     assert types["/planar/s/robot_description"] == "std_msgs/msg/String"
     assert types["/tf"] == "tf2_msgs/msg/TFMessage"

@@ -124,10 +124,10 @@ class Desk:
         self.reports: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.STATS))
         self.stream = io.BytesIO()
         self.tap = InboundQueue(self.clock)
-        own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
+        key = topics.key(SESSION, topics.RECORDER, topics.EVENT)
         info = answer_info(topics.RECORDER, scenario="", scenario_sha256="")
         publisher = EventPublisher(
-            self.bus, SESSION, info, lambda payload: self.tap.receive(own, payload)
+            self.bus, SESSION, info, lambda payload: self.tap.receive(key, payload)
         )
         writer = LogWriter(
             self.stream, scenario, SESSION, "live", epoch.unix_ns, collect_provenance()

@@ -66,12 +66,12 @@ class Way:
 
     def deliveries(self) -> list[tuple[int, str, int]]:
         """Yields arrivals: (when since the epoch, channel, number)."""
-        came = []
-        for place, (sent_ns, channel, number) in enumerate(SENT):
-            if place not in self.lost:
-                at_ns = sent_ns + 137_000 + self.late_ms.get(place, 0) * MS
-                came += [(at_ns, channel, number)] * (2 if place in self.twice else 1)
-        return sorted(came)
+        arrivals = []
+        for index, (sent_ns, channel, number) in enumerate(SENT):
+            if index not in self.lost:
+                at_ns = sent_ns + 137_000 + self.late_ms.get(index, 0) * MS
+                arrivals += [(at_ns, channel, number)] * (2 if index in self.twice else 1)
+        return sorted(arrivals)
 
 
 ARRIVES: dict[str, Callable[[bytes], Sequence[bytes]]] = {
@@ -113,7 +113,7 @@ def ways(draw: st.DrawFn) -> Way:
     places = st.integers(0, len(SENT) - 1)
     runs = draw(st.lists(st.tuples(places, st.integers(1, len(SENT))), max_size=4))
     lost = draw(st.sets(places, max_size=30)) | {
-        place for first, count in runs for place in range(first, min(first + count, len(SENT)))
+        index for first, count in runs for index in range(first, min(first + count, len(SENT)))
     }
     return Way(
         lost,
@@ -185,25 +185,25 @@ def test_logs_have_all_obtainable_messages(way: Way) -> None:
             file.setdefault(channel, []).append((number, message.log_time - UNIX_NS))
     for channel, made in MADE.items():
         account = run.desk.recording.accounts[topics.key(SESSION, "m", channel)]
-        came = [(at_ns, number) for at_ns, c, number in way.deliveries() if c == channel]
+        arrivals = [(at_ns, number) for at_ns, c, number in way.deliveries() if c == channel]
         numbers = [number for number, _ in file.get(channel, [])]
-        truth = {number for _, number in came} | set(range(way.oldest[channel], len(made)))
+        truth = {number for _, number in arrivals} | set(range(way.oldest[channel], len(made)))
         assert sorted(numbers) == sorted(truth)
         live = [(at_ns, number) for number, at_ns in file.get(channel, []) if at_ns % MS]
-        assert set(live) <= set(came)
+        assert set(live) <= set(arrivals)
         assert (account.expected, account.received) == (len(made), len(truth))
         assert account.missing == len(made) - len(truth)
         assert account.refilled == len(truth) - len(live)
-        assert account.duplicate == len(came) - len(live)
+        assert account.duplicate == len(arrivals) - len(live)
         passed = [
-            number < max(n for _, n in came[: came.index((at_ns, number)) + 1])
+            number < max(n for _, n in arrivals[: arrivals.index((at_ns, number)) + 1])
             for at_ns, number in live
         ]
         assert account.reordered == sum(passed)
         assert {n for first, last in account.gaps for n in range(first, last + 1)} == (
             set(range(len(made))) - truth
         )
-        stamps = sorted(at_ns for at_ns, _ in came)
+        stamps = sorted(at_ns for at_ns, _ in arrivals)
         silence = max((b - a for a, b in pairwise(stamps)), default=0)
         assert account.silence_ns == silence
     missing = sum(account.missing for account in run.desk.recording.accounts.values())
@@ -240,7 +240,7 @@ def test_requests_cover_one_chunk_at_a_time() -> None:
 
 def test_many_small_gaps_share_a_request() -> None:
     """Every second record is lost: one request for each would not catch up on a busy machine."""
-    lost = {place for place, (_, channel, n) in enumerate(SENT) if channel == "state" and n % 2}
+    lost = {index for index, (_, channel, n) in enumerate(SENT) if channel == "state" and n % 2}
     run = Run(Way(lost=lost))
     answer = run.site.answer
     run.site.answer = lambda: None  # type: ignore[method-assign]
@@ -254,7 +254,7 @@ def test_many_small_gaps_share_a_request() -> None:
 def test_single_gaps_are_requested_alone() -> None:
     """At low loss no message arrives twice."""
     lost = {
-        place for place, (_, channel, n) in enumerate(SENT) if channel == "state" and n == 50
+        index for index, (_, channel, n) in enumerate(SENT) if channel == "state" and n == 50
     }
     run = Run(Way(lost=lost))
     run.live(2600 * MS)

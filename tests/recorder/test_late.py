@@ -122,7 +122,7 @@ def test_recorders_take_over_from_ended_ones(tmp_path: Path, ahead_ns: int) -> N
     log = open_log(later)
     assert in_log(log) == in_virtual_time(scenario)
     assert verify(log).whole_run
-    (came,) = [event for event in log.events if event.kind == "late"]
-    assert 0 < came.t_ns < 3 * S
+    (late_event,) = [event for event in log.events if event.kind == "late"]
+    assert 0 < late_event.t_ns < 3 * S
     assert any("joins the session" in sentence for sentence in session.said)
     assert 0 < len(open_log(tmp_path / "first.mcap")["m"]) < scenario.ticks("m")

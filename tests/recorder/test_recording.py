@@ -249,8 +249,8 @@ def test_stored_means_every_record_is_stored() -> None:
     desk.write()
     assert desk.stored() == []
     assert [e.about for e in desk.log().events if e.kind == "stored"] == ["m"]
-    own = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
-    assert (own.expected, own.received) == (1, 1)
+    account = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
+    assert (account.expected, account.received) == (1, 1)
 
 
 def alive(name: str, boot: int | str) -> str:

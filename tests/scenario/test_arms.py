@@ -266,13 +266,13 @@ def test_one_number_applies_to_every_joint() -> None:
     same = six(**{"arm.armature_kg_m2": 0.1, "limits.tau_limit_nm": 50.0})
     assert same.sites["s"].arm.armature_kg_m2 == (0.1,) * 6
     drawn = six(**{"arm.armature_kg_m2": UNIFORM, "arm.payload_kg": UNIFORM})
-    found = {*drawn.sites["m1"].arm.armature_kg_m2, *drawn.sites["s"].arm.armature_kg_m2}
-    assert len(found) == 12
-    assert all(0.1 <= one <= 0.2 for one in found)
+    inertias = {*drawn.sites["m1"].arm.armature_kg_m2, *drawn.sites["s"].arm.armature_kg_m2}
+    assert len(inertias) == 12
+    assert all(0.1 <= inertia <= 0.2 for inertia in inertias)
     assert drawn.arms["m1"].theta[50] != drawn.arms["s"].theta[50]  # mass of the last link
     again = reseed_scenario(drawn, 2)
     assert again.sites["s"].arm.payload_kg != drawn.sites["s"].arm.payload_kg
-    assert not found & {*again.sites["s"].arm.armature_kg_m2}
+    assert not inertias & {*again.sites["s"].arm.armature_kg_m2}
     assert reseed_scenario(again, 1) == drawn
 
 
@@ -280,9 +280,9 @@ def test_drawn_start_poses_move_tip_operators() -> None:
     start = [0.3, {"uniform": [-1.2, -0.8]}, 1.2, -0.6, 0.5, 0.2]
     drawn = six(**{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]})
     again = reseed_scenario(drawn, 2)
-    for one in (drawn, again):
-        spec = one.sites["m1"]
-        assert list(spec.hands[0].from_m) == one.arms["m1"].end_effector(spec.q0_rad)
+    for scenario_drawn in (drawn, again):
+        spec = scenario_drawn.sites["m1"]
+        assert list(spec.hands[0].from_m) == scenario_drawn.arms["m1"].end_effector(spec.q0_rad)
     assert drawn.sites["m1"].hands[0].from_m != again.sites["m1"].hands[0].from_m
 
 
@@ -353,14 +353,14 @@ def test_a_sites_own_file_replaces_groups() -> None:
     """No key of [arm] holds for a site that names a file: tip and drives belong to the arm of the group."""
     own = {"arm": {"urdf": "arm7.urdf", "tip": "link6"}, "control": {"Kp": 0.01, "Kd": 0.0}}
     start = [0, 0, 0, -1.5, 0, 1.5]
-    one = six(
+    tables = six(
         **{f"sites.s.{key}": value for key, value in own.items()}, **{"sites.s.q0_rad": start}
     )
-    assert one.sites["s"].arm.armature_kg_m2 == (0.0,)
-    assert one.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))
-    assert set(one.urdf) == {"arm6.urdf", "arm7.urdf"}
+    assert tables.sites["s"].arm.armature_kg_m2 == (0.0,)
+    assert tables.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))
+    assert set(tables.urdf) == {"arm6.urdf", "arm7.urdf"}
     back = load_scenario(
-        one, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1}
+        tables, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1}
     )
     assert (back.sites["s"].arm.tip, set(back.urdf)) == ("", {"arm6.urdf"})
 
@@ -515,8 +515,8 @@ REACHES = {
 def test_no_pose_exceeds_the_reach(name: str, turns: list[float]) -> None:
     arm = REACHES[name]
     q = [math.pi * turn for turn in turns[: arm.counts.joints]]
-    place = arm.end_effector(q)
-    assert arm.reach.find_nearest(place) == pytest.approx(place, abs=1e-9)
+    tip = arm.end_effector(q)
+    assert arm.reach.find_nearest(tip) == pytest.approx(tip, abs=1e-9)
 
 
 def test_the_reach_of_two_links_is_exact() -> None:

@@ -43,17 +43,19 @@ def rows(draw: st.DrawFn, site: str) -> dict[str, float]:
 @st.composite
 def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
     times = sorted(draw(st.lists(st.floats(0, 100) | st.integers(0, 100), max_size=4)))
-    made = []
+    changes_made = []
     for at_s in times:
         if draw(st.booleans()):
             to = draw(links(without=("trace",)))
             to.pop("outages_s", None)
-            made.append({"at_s": at_s, "link": draw(st.sampled_from(EVERY)), "to": to})
+            changes_made.append({"at_s": at_s, "link": draw(st.sampled_from(EVERY)), "to": to})
         else:
             site = draw(st.sampled_from(NAMES))
-            made.append({"at_s": at_s, "dominance": site, "to": draw(rows(site))})
-            made[-1] |= draw(st.fixed_dictionaries({}, optional={"ramp_s": st.floats(0, 10)}))
-    return made
+            changes_made.append({"at_s": at_s, "dominance": site, "to": draw(rows(site))})
+            changes_made[-1] |= draw(
+                st.fixed_dictionaries({}, optional={"ramp_s": st.floats(0, 10)})
+            )
+    return changes_made
 
 
 overrides = st.fixed_dictionaries(

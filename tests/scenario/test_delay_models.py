@@ -18,8 +18,8 @@ from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase
 
 
 def link(keys: dict[str, Any]) -> LinkBase:
-    made: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
-    return made
+    loaded: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
+    return loaded
 
 
 def refused(keys: dict[str, Any]) -> ScenarioError:
@@ -31,14 +31,14 @@ def refused(keys: dict[str, Any]) -> ScenarioError:
 
 @given(keys=links())
 def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
-    made = link(keys)
-    mean_ms, deviation_ms = made.moments()
-    if not made.measured and not math.isnan(mean_ms):
+    loaded = link(keys)
+    mean_ms, deviation_ms = loaded.moments()
+    if not loaded.measured and not math.isnan(mean_ms):
         assert 0.0 <= mean_ms <= MAX_DELAY_US / 1000
         assert 0.0 <= deviation_ms < math.inf
-    assert made.describe()
-    points = made.points
-    model = made.to_core_model()._replace(trace_count=0 if points is None else len(points))
+    assert loaded.describe()
+    points = loaded.points
+    model = loaded.to_core_model()._replace(trace_count=0 if points is None else len(points))
     fates: Ints = due(channel([model], points=points), 50)
     kept = fates[fates != LOST]
     assert (kept >= 0).all()
@@ -47,19 +47,19 @@ def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
 @given(keys=links())
 def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
-    made = link(keys)
-    model = made.to_core_model()
+    loaded = link(keys)
+    model = loaded.to_core_model()
     assert all(
         0.0 <= p <= 1.0 + 1e-12
         for p in (model.loss_good, model.loss_bad, model.enter, model.leave)
     )
     bad = model.enter / (model.enter + model.leave)
     assert bad * model.loss_bad + (1 - bad) * model.loss_good == pytest.approx(
-        made.loss, abs=1e-12
+        loaded.loss, abs=1e-12
     )
-    if made.loss_burst and made.loss:
+    if loaded.loss_burst and loaded.loss:
         assert 1 / (1 - (1 - model.leave) * model.loss_bad) == pytest.approx(
-            made.loss_burst, rel=1e-9
+            loaded.loss_burst, rel=1e-9
         )
 
 
@@ -84,16 +84,16 @@ def test_links_are_described_in_few_words() -> None:
 
 def test_a_table_with_a_model_begins_anew() -> None:
     base = {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 50.0, "loss": 0.1}
-    own = {
+    tables = {
         "m1->s": {"half_width_ms": 5.0},
         "m2->s": {"model": "constant", "delay_ms": 7},
         "s->m1": {"preset": "5g"},
     }
-    made = load_scenario("paper", {"link": base, "links": own}).links
-    assert made["m1->s"].describe() == "uniform 100 +- 2.89 ms, loss 10 %"
-    assert made["m2->s"].describe() == "7 ms"
-    assert made["s->m1"].describe() == "hyperexponential 21.5 +- 29.1 ms"
-    assert made["s->m2"].describe() == "uniform 100 +- 28.9 ms, loss 10 %"
+    loaded = load_scenario("paper", {"link": base, "links": tables}).links
+    assert loaded["m1->s"].describe() == "uniform 100 +- 2.89 ms, loss 10 %"
+    assert loaded["m2->s"].describe() == "7 ms"
+    assert loaded["s->m1"].describe() == "hyperexponential 21.5 +- 29.1 ms"
+    assert loaded["s->m2"].describe() == "uniform 100 +- 28.9 ms, loss 10 %"
 
 
 @pytest.mark.parametrize(
@@ -226,13 +226,13 @@ def test_extreme_numbers_are_refused_or_have_moments(
     if model == "ar1":
         keys["correlation"] = 0.5
     try:
-        made = msgspec.convert({"model": model, **keys}, DELAY_MODELS[model])
+        model_of_link = msgspec.convert({"model": model, **keys}, DELAY_MODELS[model])
     except msgspec.ValidationError:
         return
-    if made.find_problem() is None:
-        assert all(math.isfinite(number) and number >= 0 for number in made.moments())
-        assert made.to_core_model().kind in set(DelayKind)
-        assert due(channel([made.to_core_model()]), 3).min() >= 0
+    if model_of_link.find_problem() is None:
+        assert all(math.isfinite(number) and number >= 0 for number in model_of_link.moments())
+        assert model_of_link.to_core_model().kind in set(DelayKind)
+        assert due(channel([model_of_link.to_core_model()]), 3).min() >= 0
 
 
 def test_traces_may_reach_the_limit() -> None:

@@ -146,10 +146,10 @@ def scenario(folder: Path, link: str) -> Any:
 
 def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n0.001,lost\n0.0025,0\n", encoding="utf-8")
-    made = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
-    assert {link.trace for link in made.links.values()} == {TEXT}
-    assert "delays.csv" not in made.text
-    assert parse_scenario(made.text) == made
+    loaded = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
+    assert {link.trace for link in loaded.links.values()} == {TEXT}
+    assert "delays.csv" not in loaded.text
+    assert parse_scenario(loaded.text) == loaded
     (path := tmp_path / "mine.toml").write_text(
         read_shipped("paper").replace(
             "delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'
@@ -157,7 +157,7 @@ def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
         "utf-8",
     )
     assert load_scenario(path).links["m1->s"].trace == TEXT
-    setup = made.setup("s").links[0]
+    setup = loaded.setup("s").links[0]
     assert setup.models[0].at_end == TraceEnd.LOOP
     assert setup.traces[0] is not None
     assert setup.traces[0].tolist() == POINTS
@@ -166,18 +166,18 @@ def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
 def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
     file = 'file = "delays.csv"'
-    made = scenario(
+    loaded = scenario(
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"'
     )
-    assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 7", "0 41200")
-    made = scenario(
+    assert (loaded.links["m1->s"].trace, loaded.links["m2->s"].trace) == ("0 7", "0 41200")
+    loaded = scenario(
         tmp_path, f'[link]\nmodel = "trace"\ntrace = "0 7"\n[links."m1->s"]\n{file}'
     )
-    assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 41200", "0 7")
-    made = scenario(
+    assert (loaded.links["m1->s"].trace, loaded.links["m2->s"].trace) == ("0 41200", "0 7")
+    loaded = scenario(
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"'
     )
-    assert (made.links["m1->s"].at_end, made.links["m2->s"].at_end) == ("loop", "hold")
+    assert (loaded.links["m1->s"].at_end, loaded.links["m2->s"].at_end) == ("loop", "hold")
 
 
 @pytest.mark.parametrize(

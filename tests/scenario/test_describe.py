@@ -29,13 +29,13 @@ def test_a_gain_of_all_sites_is_one_line() -> None:
     assert compare_texts(("free", []), ("free", ["control.Kd=5"])) == {
         "control.Kd of m1, m2, s": ("3", "5")
     }
-    found = compare_texts(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
-    assert found == {"control.Kd of s": ("3", "[5, 6]")}
+    differences = compare_texts(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
+    assert differences == {"control.Kd of s": ("3", "[5, 6]")}
 
 
 def test_another_law_is_shown_whole() -> None:
-    found = compare_texts(("free", []), ("free", ["control.law=p_d"]))
-    assert found == {
+    differences = compare_texts(("free", []), ("free", ["control.law=p_d"]))
+    assert differences == {
         "control of m1, m2, s": (
             "adaptive (Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0)",
             "p_d (K 10, d 3, gravity 1)",
@@ -44,21 +44,21 @@ def test_another_law_is_shown_whole() -> None:
 
 
 def test_links_are_described_in_words() -> None:
-    found = compare_texts(
+    differences = compare_texts(
         ("free", []), ("free", ["link.delay_ms=50"]), ("free", ["links.m1->s.delay_ms=9"])
     )
-    assert found == {
+    assert differences == {
         "link m1->s": ("200 ms", "50 ms", "9 ms"),
         "link m2->m1, s->m1, m1->m2, s->m2, m2->s": ("200 ms", "50 ms", "200 ms"),
     }
 
 
 def test_other_scenarios_other_sites_other_hands() -> None:
-    found = compare_texts(("contact", []), ("free", []))
-    assert found["sites"] == ("m, s", "m1, m2, s")
-    assert "wall" in found["environment of s"][0]
-    assert found["environment of s"][1] == "none"
-    assert found["duration_s"] == ("15", "30")
+    differences = compare_texts(("contact", []), ("free", []))
+    assert differences["sites"] == ("m, s", "m1, m2, s")
+    assert "wall" in differences["environment of s"][0]
+    assert differences["environment of s"][1] == "none"
+    assert differences["duration_s"] == ("15", "30")
 
 
 def test_chains_are_described_by_joint() -> None:

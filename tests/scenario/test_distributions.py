@@ -35,13 +35,13 @@ def draw_scenario(seed: int) -> Scenario:
 
 def test_each_number_is_drawn_separately() -> None:
     """Joints, sites and seeds differ; the same seed gives the same."""
-    one, other = draw_scenario(1), draw_scenario(2)
-    assert one == draw_scenario(1)
-    assert len(set(one.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
-    assert len({spec.arm.m1_kg for spec in (*one.sites.values(), *other.sites.values())}) == 6
-    assert one.random
-    assert not one.links_random
-    assert one.drawn["sites.m1.q0_rad.1"].value == one.sites["m1"].q0_rad[1]
+    first, other = draw_scenario(1), draw_scenario(2)
+    assert first == draw_scenario(1)
+    assert len(set(first.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
+    assert len({spec.arm.m1_kg for spec in (*first.sites.values(), *other.sites.values())}) == 6
+    assert first.random
+    assert not first.links_random
+    assert first.drawn["sites.m1.q0_rad.1"].value == first.sites["m1"].q0_rad[1]
 
 
 def test_further_drawn_numbers_change_none() -> None:
@@ -63,10 +63,10 @@ def test_numbers_follow_their_distribution() -> None:
 
 
 def test_canonical_text_holds_the_drawn_numbers() -> None:
-    one = draw_scenario(3)
-    again = parse_scenario(one.text)
-    assert again == one
-    assert again.sha256 == one.sha256
+    drawn_scenario = draw_scenario(3)
+    again = parse_scenario(drawn_scenario.text)
+    assert again == drawn_scenario
+    assert again.sha256 == drawn_scenario.sha256
     assert "[drawn" not in load_scenario("free").text
 
 
@@ -121,9 +121,9 @@ def test_changing_seeds_back_restores_the_experiment(
     other = reseed_scenario(first, seeds[1])
     assert parse_scenario(other.text).text == other.text
     assert reseed_scenario(other, seeds[0]) == first
-    for key, one in other.drawn.items():
-        if one.uniform:
-            assert one.uniform[0] - 1e-8 <= one.value <= one.uniform[1] + 1e-8, key
+    for key, number in other.drawn.items():
+        if number.uniform:
+            assert number.uniform[0] - 1e-8 <= number.value <= number.uniform[1] + 1e-8, key
 
 
 def test_replaced_numbers_stay() -> None:

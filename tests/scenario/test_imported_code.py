@@ -101,16 +101,16 @@ def test_laws_for_several_sites_get_the_number(name: str, law: str) -> None:
 
 def test_laws_are_not_told_the_unknown() -> None:
     unknown = {"sites.s.plant": "external", "sites.s.arm.known": False}
-    told = []
+    parameters = []
 
     class Listening(tests.laws.Adaptive):
         def __init__(self, facts: tests.laws.LawContext) -> None:
             super().__init__(facts)
-            told.append(facts.theta)
+            parameters.append(facts.theta)
 
     Site(load_scenario("two_sites", unknown).setup("s")._replace(law_factory=Listening))
     Site(load_scenario("two_sites").setup("s")._replace(law_factory=Listening))
-    assert told == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
+    assert parameters == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
     scenario = load_scenario(
         "two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"}
     )
@@ -121,12 +121,12 @@ def test_laws_are_not_told_the_unknown() -> None:
 def test_edited_law_files_are_taken_anew(folder: Path) -> None:
     file = folder / "edited_law.py"
     text = "from tests.laws import Adaptive\nclass Law(Adaptive):\n    theta_hat0 = {}\n"
-    made = []
+    laws = []
     for value in ("1", "2.5"):
         file.write_text(text.format(value))
         site = Site(load_scenario("two_sites", {"control.law": "edited_law:Law"}).setup("s"))
-        made.append(site._user_law.theta_hat0)
-    assert made == [1, 2.5]
+        laws.append(site._user_law.theta_hat0)
+    assert laws == [1, 2.5]
 
 
 RESOLVED = load_scenario(
@@ -264,9 +264,9 @@ def test_sites_get_their_named_law_and_scheme(
     sends: str, overrides: dict[str, object], fact: str, folder: Path
 ) -> None:
     scenario = load_sending(folder, "{'u': {}}")
-    made = "def __init__(self, *_): raise OSError"
+    method = "def __init__(self, *_): raise OSError"
     file, before = folder / "sending.py", scenario.sites["s"].control.source_sha256
-    file.write_text(SENDING.replace("{SENDS}", f"{sends}\n    {made}"))
+    file.write_text(SENDING.replace("{SENDS}", f"{sends}\n    {method}"))
     named = scenario.text.replace(before, hashlib.sha256(file.read_bytes()).hexdigest())
     scenario = load_scenario(load_scenario(named), overrides)
     with pytest.raises(ScenarioError, match=fact or "OSError"):

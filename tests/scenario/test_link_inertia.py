@@ -139,7 +139,7 @@ def test_side_links_never_make_arms_unusable(
 ) -> None:
     chain = read_urdf(finger(body=body, kind=kind), tip="lower")
     assert chain.joints[1].inertia[0] == mass_kg
-    assert any(note in one for one in chain.notes)
+    assert any(note in text for text in chain.notes)
     least, middle, most = body_moments(chain, 1)
     assert least > 0.0
     assert most <= (least + middle) * (1.0 + 1e-6)
@@ -341,7 +341,7 @@ def test_sites_mend_links_beyond_their_group() -> None:
     """Also for names that TOML quotes, and for drawn numbers."""
     text = SHAPES.replace('"tool"', '"tool.1"')
     shared = {"yaw": YAW, "tool.1": {"mass_kg": 0.4}}
-    own = {
+    tables = {
         "arm": {
             "links": {
                 "tool.1": {"com_m": [0.0, 0.0, 0.1]},
@@ -349,7 +349,7 @@ def test_sites_mend_links_beyond_their_group() -> None:
             }
         }
     }
-    scenario = of_arm(text, {"links": shared}, s=own)
+    scenario = of_arm(text, {"links": shared}, s=tables)
     m, s = (scenario.sites[name].arm.links for name in "ms")
     assert m["tool.1"] == LinkInertia(mass_kg=0.4)
     assert s["tool.1"] == LinkInertia(mass_kg=0.4, com_m=(0.0, 0.0, 0.1))

@@ -98,12 +98,12 @@ print(json.dumps({
 def test_an_added_file_acts_in_every_driver(tmp_path: Path, scenario: str) -> None:
     put_beside(tmp_path, "scenario/operators", "tremor.py", OPERATOR)
     put_beside(tmp_path, "scenario/delay_models", "two_paths.py", DELAY)
-    found = look(LOOK.replace("SCENARIO", json.dumps(scenario)), tmp_path)
-    assert found["identical"] == [True, True]
-    assert any("two_paths 8.5 +- 3.5 ms" in line for line in found["check"])
-    assert found["moved"] > 0.0
-    assert found["roots"]
-    assert "hands[0].turn_rad_s: must be a frequency, rad/s, but is -1.0" in found["refused"]
+    output = look(LOOK.replace("SCENARIO", json.dumps(scenario)), tmp_path)
+    assert output["identical"] == [True, True]
+    assert any("two_paths 8.5 +- 3.5 ms" in line for line in output["check"])
+    assert output["moved"] > 0.0
+    assert output["roots"]
+    assert "hands[0].turn_rad_s: must be a frequency, rad/s, but is -1.0" in output["refused"]
 
 
 numbers = st.floats(-2.0, 2.0)

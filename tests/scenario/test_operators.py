@@ -38,8 +38,8 @@ def refused(group: str, entry: Any) -> str:
 
 def test_every_kind_has_a_valid_example() -> None:
     for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-        shown = [kind for kind in kinds if kind not in ("live", "own")]
-        assert [entry["kind"] for entry in GROUPS[group]] == shown
+        kinds_of_file = [kind for kind in kinds if kind not in ("live", "own")]
+        assert [entry["kind"] for entry in GROUPS[group]] == kinds_of_file
         assert len(
             getattr(
                 load_scenario("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group

@@ -178,8 +178,8 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
         scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
     )
     assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
-    made = to_core_change(scenario, change)
-    assert (made.peer, made.model) == (
+    change_made = to_core_change(scenario, change)
+    assert (change_made.peer, change_made.model) == (
         0,
         LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
     )
@@ -217,15 +217,15 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
         load_scenario("free", {**short, "timeline": [script]}),
     )
     written = {key: value for key, value in script.items() if key != "at_s"}
-    made = to_core_change(plain, ordered(plain, written, at_ns))
+    change_made = to_core_change(plain, ordered(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
-    commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [made]}}))
+    commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [change_made]}}))
     scripted_run = list(virtual.execute_virtual(planned))
     assert [step.output._replace(cmd=[]) for step in commanded] == [
         step.output for step in scripted_run
     ]
     named = [step.output for step in commanded if step.output.cmd]
-    assert [(output.tick, output.cmd) for output in named] == [(k, [made.text])]
+    assert [(output.tick, output.cmd) for output in named] == [(k, [change_made.text])]
     assert commanded != list(virtual.execute_virtual(plain))
 
 

@@ -49,15 +49,15 @@ def test_pictures_are_delayed_like_links(view: dict[str, Any], peer_hz: int) -> 
 def test_late_viewers_see_the_same() -> None:
     scenario = load_scenario("paper", {"sites.m1.view": MODELS["lossy gamma"], "rate_hz": 50})
     from_first, late = (PictureDelay(scenario, "m1") for _ in range(2))
-    shown = [from_first.advance_to(tick, {}) for tick in range(3000)]
-    assert [late.advance_to(tick, {}) for tick in range(2800, 3000)] == shown[2800:]
+    states = [from_first.advance_to(tick, {}) for tick in range(3000)]
+    assert [late.advance_to(tick, {}) for tick in range(2800, 3000)] == states[2800:]
 
 
 def test_outages_show_nothing() -> None:
     view = {"delay_ms": 100.0, "outages_s": [[0.5, 1.0]]}
     picture = PictureDelay(load_scenario("paper", {"sites.m1.view": view}), "m1")
-    shown = np.array([picture.advance_to(tick, {})["s"] for tick in range(1500)])
-    assert shown[[599, 600, 1099, 1100]].tolist() == [499, 499, 499, 1000]
+    pictures = np.array([picture.advance_to(tick, {})["s"] for tick in range(1500)])
+    assert pictures[[599, 600, 1099, 1100]].tolist() == [499, 499, 499, 1000]
 
 
 def test_pictures_never_influence_the_run() -> None:

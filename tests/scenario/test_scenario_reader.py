@@ -172,9 +172,9 @@ def test_overrides_reach_list_entries_by_number() -> None:
         {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5},
     )
     assert resolved == stiff
-    given: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
-    apply_overrides(given, ["a.0.b.1=5", "a.1.c=6"])
-    assert given == {"a": [{"b": [1, 5]}, {"c": 6}]}
+    tables: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
+    apply_overrides(tables, ["a.0.b.1=5", "a.1.c=6"])
+    assert tables == {"a": [{"b": [1, 5]}, {"c": 6}]}
 
 
 @pytest.mark.parametrize(
@@ -210,9 +210,9 @@ def test_overrides_reach_list_entries_by_number() -> None:
     ],
 )
 def test_entries_outside_a_list_are_refused(key: str, path: str, problem: str) -> None:
-    found = refused([f"{key}=1"], read_shipped("contact"))
-    assert found.path == path
-    assert problem in found.problem
+    reason = refused([f"{key}=1"], read_shipped("contact"))
+    assert reason.path == path
+    assert problem in reason.problem
 
 
 def test_single_numbers_apply_to_all_joints() -> None:

@@ -16,8 +16,8 @@ def run_shipped(name: str, overrides: dict[str, Any] | None = None) -> Run:
 def ages(run: Run) -> np.ndarray:
     used = run.stack("used")
     ticks = np.arange(used.shape[1])[None, :, None]
-    made: np.ndarray = (ticks - used)[used >= 0]
-    return made
+    age_ticks: np.ndarray = (ticks - used)[used >= 0]
+    return age_ticks
 
 
 @pytest.mark.long
@@ -29,14 +29,14 @@ def test_newer_samples_overtake_on_4g() -> None:
 
 @pytest.mark.long
 def test_handover_changes_sides_without_a_step() -> None:
-    made = run_shipped("handover", {"duration_s": 13.1})
-    m1, m2, s = (made.sites[name].q[:, 0] for name in ("m1", "m2", "s"))
+    run = run_shipped("handover", {"duration_s": 13.1})
+    m1, m2, s = (run.sites[name].q[:, 0] for name in ("m1", "m2", "s"))
     beyond = s - (m1 + m2) / 2
     assert beyond[9900] > 0.14
     assert beyond[13_000] < -0.16
-    steps = np.abs(np.diff(made.sites["s"].q_des, axis=0))
+    steps = np.abs(np.diff(run.sites["s"].q_des, axis=0))
     assert steps.max() < 1e-3
-    q_des, qd_des = made.sites["s"].q_des, made.sites["s"].qd_des
+    q_des, qd_des = run.sites["s"].q_des, run.sites["s"].qd_des
     central = (q_des[2:] - q_des[:-2]) / 2e-3
     ramp = slice(10_010, 11_990)
     assert np.abs(central[ramp] - qd_des[1:-1][ramp]).max() < 1e-3

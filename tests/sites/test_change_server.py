@@ -50,11 +50,11 @@ class Asked:
 @given(st.integers(0, 10_000))
 def test_accepted_changes_name_their_recorded_first_tick(k: int) -> None:
     """The next record repeats the command, which holds from the tick of the answer on."""
-    asked = Asked()
-    (taken,), reply = asked.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
+    requests = Asked()
+    (taken,), reply = requests.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
     assert reply.accepted
     assert reply.tick == k + AHEAD_MS
-    assert parse_core_change(asked.scenario, "s", taken.text) == taken
+    assert parse_core_change(requests.scenario, "s", taken.text) == taken
     assert taken.model is not None
     assert (taken.peer, taken.model.from_ns) == (0, reply.tick * 1_000_000)
     assert (taken.model.location, taken.model.loss_good) == (350_000.0, 0.05)
@@ -62,10 +62,10 @@ def test_accepted_changes_name_their_recorded_first_tick(k: int) -> None:
 
 def test_changes_leave_unnamed_keys_unchanged() -> None:
     later = {"at_s": 1.0, "link": "m1->s", "to": {"loss": 0.25}}
-    asked = Asked(load_scenario("paper", {"timeline": [later]}))
-    (before,), _ = asked.ask(10, link="m1->s", to={"duplicate": 0.5})
-    (after,), _ = asked.ask(1000, link="m1->s", to={"delay_ms": 10.0})
-    (last,), _ = asked.ask(1001, link="m1->s", to={"playout_ms": 20.0})
+    requests = Asked(load_scenario("paper", {"timeline": [later]}))
+    (before,), _ = requests.ask(10, link="m1->s", to={"duplicate": 0.5})
+    (after,), _ = requests.ask(1000, link="m1->s", to={"delay_ms": 10.0})
+    (last,), _ = requests.ask(1001, link="m1->s", to={"playout_ms": 20.0})
     models = [taken.model for taken in (before, after, last)]
     assert [m and (m.location, m.loss_good, m.duplicate, m.playout_us) for m in models] == [
         (200_000.0, 0.0, 0.5, 0),
@@ -90,15 +90,15 @@ def test_dominance_is_ramped_for_every_sender() -> None:
 
 def test_triangle_drags_of_a_minute_are_obeyed() -> None:
     """Thirty orders a second, as a page sends them; a flood within the time before they hold is refused."""
-    asked = Asked()
-    site = Site(asked.scenario.setup("s"))
+    requests = Asked()
+    site = Site(requests.scenario.setup("s"))
     for n in range(1800):
-        (taken,), _ = asked.ask(
+        (taken,), _ = requests.ask(
             10 * n, dominance="s", to={"m1": 0.5 + n / 4000, "m2": 0.5 - n / 4000}
         )
         site.apply_change(taken, 10 * n * 1_000_000)
     replies = [
-        asked.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1]
+        requests.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1]
         for _ in range(MAX_RAMPS + 1)
     ]
     assert [reply.accepted for reply in replies] == [True] * MAX_RAMPS + [False]
@@ -134,11 +134,11 @@ def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
     in one tick.
     """
     site, mode, replies = Site(GLIDES.setup("s")), Mode.WAITING, []
-    asked = Asked(GLIDES, lambda: mode)
+    requests = Asked(GLIDES, lambda: mode)
     for k in range(20):
         batch = batches[k] if k < len(batches) else ()
-        replies += [asked.send(encode(ChangeRequest(order=order))) for order in batch]
-        mode = site.step(TickInput(k, commands=list(asked.changes.pop_changes(k)))).mode
+        replies += [requests.send(encode(ChangeRequest(order=order))) for order in batch]
+        mode = site.step(TickInput(k, commands=list(requests.changes.pop_changes(k)))).mode
     answers = [answer for reply in replies if (answer := reply.poll())]
     assert len(answers) == len(replies)
     return [decode(answer[1], ChangeReply).accepted for answer in answers], mode
@@ -157,9 +157,9 @@ def test_clients_of_other_versions_are_refused() -> None:
 
 
 def test_invalid_orders_are_answered_and_harmless() -> None:
-    asked = Asked()
-    replies = [asked.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
-    assert asked.changes.pop_changes(0) == []
+    requests = Asked()
+    replies = [requests.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
+    assert requests.changes.pop_changes(0) == []
     assert all(
         (answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies
     )
@@ -173,20 +173,20 @@ def test_changes_after_the_runs_end_are_refused() -> None:
 
 def test_changes_in_a_run_are_bounded() -> None:
     """L6: the site's tables hold every change that was accepted, and one more is refused."""
-    asked = Asked()
-    site = Site(asked.scenario.setup("s"))
+    requests = Asked()
+    site = Site(requests.scenario.setup("s"))
     for k in range(MAX_CHANGES):
-        (taken,), _ = asked.ask(k, link="m1->s", to={"delay_ms": float(k)})
+        (taken,), _ = requests.ask(k, link="m1->s", to={"delay_ms": float(k)})
         assert site.step(TickInput(k, (), [taken])).cmd == [taken.text]
-    assert asked.ask(MAX_CHANGES, link="m1->s", to={"delay_ms": 1.0})[0] == []
+    assert requests.ask(MAX_CHANGES, link="m1->s", to={"delay_ms": 1.0})[0] == []
 
 
 def test_marks_change_nothing_and_wait_for_events() -> None:
-    asked = Asked()
-    taken, reply = asked.ask(7, mark="the wall")
+    requests = Asked()
+    taken, reply = requests.ask(7, mark="the wall")
     assert (taken, reply.accepted, reply.tick) == ([], True, 7)
-    assert asked.changes.marks == [(7, "the wall")]
-    replies = [asked.ask(8, mark=str(n))[1] for n in range(MARKS_WAITING)]
+    assert requests.changes.marks == [(7, "the wall")]
+    replies = [requests.ask(8, mark=str(n))[1] for n in range(MARKS_WAITING)]
     assert [reply.accepted for reply in replies] == [True] * (MARKS_WAITING - 1) + [False]
 
 
@@ -202,37 +202,37 @@ def test_marks_change_nothing_and_wait_for_events() -> None:
     ],
 )
 def test_every_members_key_allows_stop_only(more: dict[str, Any]) -> None:
-    asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
-    garbage = asked.send(b"garbage", STOP)
-    taken, reply = asked.ask(10, STOP, **more)
+    requests = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
+    garbage = requests.send(b"garbage", STOP)
+    taken, reply = requests.ask(10, STOP, **more)
     assert (taken, reply.accepted) == ([], False)
     assert "only requests to stop" in reply.text
     assert (answer := garbage.poll()) is not None
     assert not decode(answer[1], ChangeReply).accepted
-    (change,), reply = asked.ask(11, STOP, order="stop")
+    (change,), reply = requests.ask(11, STOP, order="stop")
     assert reply.accepted
     assert '"order":"stop"' in change.text
 
 
 def test_orderers_are_kept_until_an_event() -> None:
-    asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
-    (taken,), reply = asked.ask(5, STOP, order="stop", source="the experimenter")
+    requests = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
+    (taken,), reply = requests.ask(5, STOP, order="stop", source="the experimenter")
     assert reply.accepted
-    assert asked.changes.sources == {taken.text: "the experimenter"}
+    assert requests.changes.sources == {taken.text: "the experimenter"}
     assert "experimenter" not in taken.text  # the record, and so every execution, is the same
-    (other,), _ = asked.ask(6, STOP, order="stop")
-    assert other.text not in asked.changes.sources
+    (other,), _ = requests.ask(6, STOP, order="stop")
+    assert other.text not in requests.changes.sources
 
 
 def test_marks_claim_no_change() -> None:
-    asked = Asked()
+    requests = Asked()
     for order in (
         {"link": "m1->s", "to": {"loss": 0.5}, "source": "m1"},
         {"mark": "here", "source": "m2"},
     ):
-        asked.send(encode(ChangeRequest(**order)))
-    (change,) = asked.changes.pop_changes(10)
-    assert asked.changes.sources == {change.text: "m1"}
+        requests.send(encode(ChangeRequest(**order)))
+    (change,) = requests.changes.pop_changes(10)
+    assert requests.changes.sources == {change.text: "m1"}
 
 
 def test_request_without_source_has_the_old_bytes() -> None:

@@ -36,9 +36,9 @@ def test_a_failing_measurement_gives_its_reason(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(doctor, "_RATES_CODE", failing)
     monkeypatch.setattr(doctor, "_RIGHTS_CODE", failing)
     monkeypatch.setattr(doctor, "is_core_cached", lambda: True)
-    for found in (doctor.examine_rate(), *doctor.examine_rights()):
-        assert found.state == "warn"
-        assert found.text.endswith("failed (exit code 1: MemoryError: no more pages)")
+    for finding in (doctor.examine_rate(), *doctor.examine_rights()):
+        assert finding.state == "warn"
+        assert finding.text.endswith("failed (exit code 1: MemoryError: no more pages)")
 
 
 @pytest.fixture(scope="module")
@@ -68,21 +68,21 @@ def states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
 
 
 def test_valid_keys_pass(folder: Path) -> None:
-    (found,) = examine_keys(folder / "m1")
-    assert found.state == "ok"
-    assert "m1 of m1, s, recorder, until" in found.text
+    (finding,) = examine_keys(folder / "m1")
+    assert finding.state == "ok"
+    assert "m1 of m1, s, recorder, until" in finding.text
     assert states(examine_keys(None)) == ["ok"]
 
 
 def test_keys_ending_soon_or_open_are_reported(tmp_path: Path) -> None:
     create_keys(tmp_path / "keys", MEMBERS, [], 3)
     (tmp_path / "keys" / "m1").chmod(0o755)
-    found = list(examine_keys(tmp_path / "keys" / "m1"))
-    assert [one.state for one in found] == ["warn"] * 3
+    findings = list(examine_keys(tmp_path / "keys" / "m1"))
+    assert [finding.state for finding in findings] == ["warn"] * 3
     assert [
-        "soon" in found[0].text,
-        "chmod 700" in found[1].text,
-        "authority" in found[2].text,
+        "soon" in findings[0].text,
+        "chmod 700" in findings[1].text,
+        "authority" in findings[2].text,
     ] == [True] * 3
     (tmp_path / "keys" / "m1" / "private.key").chmod(0o640)
     (refused,) = examine_keys(tmp_path / "keys" / "m1")
@@ -108,13 +108,13 @@ def member(folder: Path, place: str) -> Iterator[None]:
 
 def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
-    (place, nobody) = (
+    (endpoint, nobody) = (
         free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(2)
     )
-    with member(folder / "m1", place):
-        assert links(folder / "s", [], [place]) == ["ok"]
-        assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]  # another authority
-        assert links(folder / "s", [place], []) == ["fail"]  # the port is taken
+    with member(folder / "m1", endpoint):
+        assert links(folder / "s", [], [endpoint]) == ["ok"]
+        assert links(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]  # another authority
+        assert links(folder / "s", [endpoint], []) == ["fail"]  # the port is taken
     assert links(folder / "s", [], [nobody]) == ["fail"]
     assert links(folder / "s", [nobody], []) == ["ok"]
 
@@ -122,14 +122,14 @@ def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) ->
 @pytest.mark.long
 def test_members_answer_over_quic(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
-    (place, nobody) = (
+    (endpoint, nobody) = (
         free_endpoint.replace("tcp", "quic") for free_endpoint in find_free_endpoints(2)
     )
-    with member(folder / "m1", place):
-        assert links(folder / "s", [], [place]) == ["ok"]
-        assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]
-        assert links(None, [], [place]) == ["warn"]
-        assert links(folder / "s", [place], []) == ["fail"]
+    with member(folder / "m1", endpoint):
+        assert links(folder / "s", [], [endpoint]) == ["ok"]
+        assert links(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]
+        assert links(None, [], [endpoint]) == ["warn"]
+        assert links(folder / "s", [endpoint], []) == ["fail"]
     assert links(folder / "s", [], [nobody]) == ["fail"]
     assert links(folder / "s", [nobody], []) == ["ok"]
 
@@ -173,12 +173,12 @@ def test_a_nearly_full_disk_is_reported(
     free: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
-    found = [
+    findings = [
         finding
         for finding in examine_room(tmp_path / "not" / "there")
         if finding.check == "disk"
     ]
-    assert [one.state for one in found] == [state]
+    assert [one.state for one in findings] == [state]
 
 
 def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,10 +207,10 @@ def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_rates_hold_if_ticks_begin_in_time(late_ns: int, stride: int, held: list[bool]) -> None:
     """One tick in a hundred may begin in the second half of its period, or later."""
-    found = doctor.rehearse_rates(UnpunctualClock(late_ns, stride))
-    assert [doctor.is_held(*one[:2]) for one in found] == held
-    assert [rate_hz for rate_hz, _, _ in found] == list(doctor.RATES_HZ[: len(held)])
-    assert found[0][2] == late_ns // 1000
+    rates = doctor.rehearse_rates(UnpunctualClock(late_ns, stride))
+    assert [doctor.is_held(*rate[:2]) for rate in rates] == held
+    assert [rate_hz for rate_hz, _, _ in rates] == list(doctor.RATES_HZ[: len(held)])
+    assert rates[0][2] == late_ns // 1000
 
 
 @pytest.mark.parametrize(
@@ -230,9 +230,9 @@ def test_rates_are_reported_with_their_lateness(
 ) -> None:
     done = SimpleNamespace(returncode=0, stdout=json.dumps(rates))
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
-    found = doctor.examine_rate()
-    assert found.state == state
-    assert text in found.text
+    findings = doctor.examine_rate()
+    assert findings.state == state
+    assert text in findings.text
 
 
 def test_real_loops_are_measured_in_own_processes() -> None:
@@ -246,9 +246,9 @@ def test_promised_findings_are_reported(
     kernel: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "system", lambda: kernel)
-    found = doctor.examine_system()
-    assert found.state == ("warn" if name else "ok")
-    assert name in found.text
+    findings = doctor.examine_system()
+    assert findings.state == ("warn" if name else "ok")
+    assert name in findings.text
 
 
 def test_open_rights_are_no_finding_on_windows(
@@ -271,7 +271,7 @@ def test_the_command_exits_1_on_failures(
     monkeypatch.setattr(doctor, "examine_rate", lambda: doctor.DoctorFinding("rate", "ok", ""))
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     done = trilat("doctor", "--json", cwd=tmp_path)
-    assert {one["check"] for one in json.loads(done.out)} >= {
+    assert {finding["check"] for finding in json.loads(done.out)} >= {
         "keys",
         "links",
         "clock",
@@ -287,7 +287,7 @@ def test_the_command_exits_1_on_failures(
 def test_an_unanswering_session_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "CONNECT_S", 0.2)
     connection = Connection((), find_free_endpoints(1))
-    found = list(
+    findings = list(
         examine_machine(connection, None, tmp_path, "x", SystemClock(), insecure=False)
     )
-    assert ("clock", "fail") in {(one.check, one.state) for one in found}
+    assert ("clock", "fail") in {(finding.check, finding.state) for finding in findings}

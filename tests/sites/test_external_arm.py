@@ -124,7 +124,9 @@ def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     assert ends == {"m": 0, "s": 0}
     records = [[*state.q, *state.qd] for state in log["s"].states]
     # every measurement, in order, to the bit
-    assert records in [sent[n : n + 1000] for n, one in enumerate(sent) if one == records[0]]
+    assert records in [
+        sent[n : n + 1000] for n, record_sent in enumerate(sent) if record_sent == records[0]
+    ]
     taus = [tuple(state.tau) for state in log["s"].states]
     assert [tau for tau in torques if tau in taus] == torques
     assert set(taus[:-1]) <= set(torques)
@@ -161,7 +163,9 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
     log = session.run()
     assert set(session.ends.values()) == {0}
     records = [[*state.q, *state.qd, *state.tau_x] for state in log["s"].states]
-    assert records in [sent[n : n + 300] for n, one in enumerate(sent) if one == records[0]]
+    assert records in [
+        sent[n : n + 300] for n, record_sent in enumerate(sent) if record_sent == records[0]
+    ]
     assert abs(log["s"].tau_x).min(axis=0).max() > 0.0
     whole(log)
 

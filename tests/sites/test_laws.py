@@ -51,14 +51,14 @@ def test_failing_laws_end_the_session_in_order(how: str, tmp_path: Path) -> None
         assert str(ends[other]) == f"{other} ended because {text}"
     assert log.complete
     assert [event.text for event in log.events if event.kind == "failed"] == [text]
-    made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    assert made["m2"] == len(log["m2"]) == 250
+    ticks_made = {event.member: event.ticks for event in log.events if event.kind == "end"}
+    assert ticks_made["m2"] == len(log["m2"]) == 250
     for other in ("m1", "s"):
-        assert 250 < made[other] == len(log[other]) < 500
+        assert 250 < ticks_made[other] == len(log[other]) < 500
     assert verify(log).passed
     twins = compare_with_virtual(log)
     assert twins.fed.first is None
-    assert twins.fed.identical == sum(made.values())
+    assert twins.fed.identical == sum(ticks_made.values())
 
 
 def test_laws_failing_at_rest_are_found_beforehand() -> None:

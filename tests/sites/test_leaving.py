@@ -187,10 +187,10 @@ def test_late_recorders_learn_of_ticks_not_made(tmp_path: Path) -> None:
     session.recorder(at_ns=7 * S)
     log = session.run()
     ((first, _),) = log.starts["m"]
-    ((away, last),) = log.absences["m"]
-    assert (away, last) == (log["s"].used["m"][log["s"].tick < first].max() + 1, first - 1)
+    ((absence, last),) = log.absences["m"]
+    assert (absence, last) == (log["s"].used["m"][log["s"].tick < first].max() + 1, first - 1)
     # the memory of the first start went with it; the other site heard all
-    assert log.missing("m") == away
+    assert log.missing("m") == absence
     assert len(log["s"]) == 1600
     assert log.missing("s") == 0
     assert "agree with the messages" in [
@@ -250,13 +250,13 @@ def test_sites_report_peers_that_cannot_hear_them(tmp_path: Path) -> None:
     session.lose("m", "trilat/t/m/sample", 3 * S, 3 * S + 600_000_000)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    told = [
+    texts = [
         (event.kind, event.about, event.t_ns) for event in log.events if "hear" in event.kind
     ]
-    assert [kind for kind, _, _ in told] == ["unheard", "heard"]
-    assert {about for _, about, _ in told} == {"s"}
+    assert [kind for kind, _, _ in texts] == ["unheard", "heard"]
+    assert {about for _, about, _ in texts} == {"s"}
     cut_s = 3.0 - log.events[0].epoch_mono_ns / S if log.events[0].epoch_mono_ns else 0.0
-    assert 0.2 <= told[0][2] / S - cut_s <= 0.4
+    assert 0.2 <= texts[0][2] / S - cut_s <= 0.4
     assert "hold" in log["s"].mode
     assert "hold" not in log["m"].mode
     assert verify(log).passed
@@ -280,7 +280,11 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     assert premises["records"].holds
     assert certificate.evidence.functional_share == 1.0
     assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
-    link = next(one for one in summarise_links(log) if (one.peer, one.site) == ("m1", "s"))
+    link = next(
+        link_of_log
+        for link_of_log in summarise_links(log)
+        if (link_of_log.peer, link_of_log.site) == ("m1", "s")
+    )
     assert link.loss == 0.0
 
 

@@ -83,8 +83,8 @@ def test_an_absent_far_end_is_reported() -> None:
 
 def row(needs, p99_ms: float, lost: int = 0) -> dict:
     times = {"p50": 500 * p99_ms, "p99": 1e3 * p99_ms, "max": 2e3 * p99_ms}
-    own = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
-    return {**own, "lost": lost, "one_way_us": times}
+    facts = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
+    return {**facts, "lost": lost, "one_way_us": times}
 
 
 @pytest.mark.long
@@ -92,7 +92,9 @@ def test_delay_margins_judge_a_network() -> None:
     """P+d at 200 ms tolerates up to 229.8 ms, docs/studies/linear.md, and its links hide shorter delays."""
     needs = find_needs(tn.load_scenario("p_d_margin"))
     margin = tn.linear("p_d_margin", ports=False).to_dict()["margin"]["stable"]
-    assert needs.stable_ms == [[1e3 * one["from_s"], 1e3 * one["to_s"]] for one in margin]
+    assert needs.stable_ms == [
+        [1e3 * window["from_s"], 1e3 * window["to_s"]] for window in margin
+    ]
     edge_ms = needs.stable_ms[0][1]
     assert edge_ms == pytest.approx(229.8, abs=0.05)
     hidden = judge_network(needs, row(needs, 150.0))
@@ -181,8 +183,16 @@ def test_loopback_is_measured() -> None:
 
 @pytest.mark.long
 def test_the_command_measures_all_transports_and_draws(tmp_path) -> None:
-    words = ["--benchmark", "p_d_margin", "--seconds", "3", "--figure", "network.png", "--json"]
-    facts = json.loads(trilat("ping", *words, cwd=tmp_path).out)
+    arguments = [
+        "--benchmark",
+        "p_d_margin",
+        "--seconds",
+        "3",
+        "--figure",
+        "network.png",
+        "--json",
+    ]
+    facts = json.loads(trilat("ping", *arguments, cwd=tmp_path).out)
     assert [transport["transport"] for transport in facts["transports"]] == [
         "tcp",
         "tls",

@@ -56,10 +56,14 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
     log = open_log(session.path)
     # it listens for longer than the delay
     for one, true in list(zip(seen, newest, strict=True))[5:]:
-        own = one["m1"]
+        own_state = one["m1"]
         for peer in ("m2", "s"):
-            assert one[peer].tick == own.used[peer] == log["m1"].states[own.tick].used[peer]
-            assert np.array_equal(one[peer].q, log[peer].q[own.used[peer]])
+            assert (
+                one[peer].tick
+                == own_state.used[peer]
+                == log["m1"].states[own_state.tick].used[peer]
+            )
+            assert np.array_equal(one[peer].q, log[peer].q[own_state.used[peer]])
             assert true[peer].tick - one[peer].tick >= 120 - 11  # records come ten at a time
     assert seen
 

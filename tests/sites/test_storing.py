@@ -79,12 +79,12 @@ def test_on_a_full_disk_accounts_match_the_file(
     assert verdict.agreed
     assert verdict.integrity.passed
     assert not verdict.passed  # no site could say how it ended
-    found = records(path)
+    stored = records(path)
     for name in SITES:
         assert [state.tick for state in log[name].states] == list(range(len(log[name])))
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             topic = "/" + topics.key(SESSION, name, channel)
-            assert f"received {found[topic]}, missing 0" in log.accounts[topic]
+            assert f"received {stored[topic]}, missing 0" in log.accounts[topic]
     assert session.relay.results == dict.fromkeys(SITES, 0)  # the sites went on
 
 

@@ -38,8 +38,8 @@ def link_stats() -> LinkStats:
         name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")
     }
     zeros = dict.fromkeys(("overruns", "late_max_us", "busy_max_us"), 0)
-    own = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
-    return LinkStats(**own, **counts, **zeros, delay_us={"s": 120})
+    facts = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
+    return LinkStats(**facts, **counts, **zeros, delay_us={"s": 120})
 
 
 def ping_sites() -> PingReport:

@@ -21,12 +21,12 @@ from trilat_net.work.executor import (
 
 
 def test_any_executor_gives_the_results_of_this_process() -> None:
-    shown: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     with ThreadPoolExecutor(3) as threads, open_worker_pool(None, threads) as pool:
-        assert pool.map(abs, range(-50, 0), lambda *one: shown.append(one)) == list(
+        assert pool.map(abs, range(-50, 0), lambda *one: progress.append(one)) == list(
             range(50, 0, -1)
         )
-    assert shown == [(n, 50) for n in range(1, 51)]
+    assert progress == [(n, 50) for n in range(1, 51)]
     with open_worker_pool(1) as pool:
         assert list(pool.iterate_results(abs, [-3, 2])) == [(0, 3), (1, 2)]
 
@@ -114,8 +114,8 @@ def test_an_item_that_ends_every_worker_is_named() -> None:
     pool = WorkerPool(FragileExecutor(), 2, FragileExecutor, hint="; what to do")
     with pytest.raises(RunFailed, match=f"^{MAX_LOSSES} .* while running 7; what to do$"):
         pool.map(abs, range(30))
-    found = dict(pool.iterate_results(abs, range(30), lambda item: -item))
-    assert found == {n: -7 if n == 7 else n for n in range(30)}
+    results = dict(pool.iterate_results(abs, range(30), lambda item: -item))
+    assert results == {n: -7 if n == 7 else n for n in range(30)}
 
 
 def test_jobs_belong_to_this_machine() -> None:

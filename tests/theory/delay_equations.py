@@ -192,8 +192,14 @@ def exact(name: str) -> DelayEquations:
 @cache
 def distance(name: str, scheme: str, rate_hz: int) -> float:
     """Returns max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
-    made = sampled(load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S)
-    return float(np.abs(made[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]).max())
+    trajectory_at_times = sampled(
+        load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S
+    )
+    return float(
+        np.abs(
+            trajectory_at_times[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]
+        ).max()
+    )
 
 
 def order(name: str, scheme: str) -> list[float]:

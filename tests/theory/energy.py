@@ -75,8 +75,10 @@ def balance(run: Run, beta: Array) -> Balance:
             ticks = round(scenario.links[f"{peer}->{name}"].delay_ms * 1e-3 * rate_hz)
             norm = cumulative((Kd * qd**2).sum(1), h)
             v += share * (norm - delayed(norm, ticks))
-            came = np.stack([delayed(qd[:, joint], ticks) for joint in (0, 1)], axis=1)
-            loss += 0.5 * share * (Kd * (site.qd - came) ** 2).sum(1)
+            delayed_speeds = np.stack(
+                [delayed(qd[:, joint], ticks) for joint in (0, 1)], axis=1
+            )
+            loss += 0.5 * share * (Kd * (site.qd - delayed_speeds) ** 2).sum(1)
         V = V + weight * 0.5 * v
         taken = taken + weight * cumulative(loss, h)
         given = given + weight * cumulative((r * -site.tau_x).sum(1), h)
@@ -85,8 +87,10 @@ def balance(run: Run, beta: Array) -> Balance:
 
 def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Balance:
     """Returns the balance of a shipped scenario."""
-    made = run(name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S})
-    return balance(made, left_null_vector(made.scenario))
+    trajectory_of_run = run(
+        name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
+    )
+    return balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))
 
 
 def order(name: str, scheme: str, rate_hz: int) -> float:

@@ -20,7 +20,7 @@ def measured(
     """Returns a shipped scenario, changed, in virtual time; its windows are (from, to, site),
     "" for all sites.
     """
-    asked = [
+    windows_of_run = [
         {
             "from_s": from_s,
             "to_s": to_s,
@@ -30,7 +30,7 @@ def measured(
         for from_s, to_s, site in windows
     ]
     return measure_virtual_run(
-        load_scenario(name, {**(overrides or {}), "expect": {"windows": asked}})
+        load_scenario(name, {**(overrides or {}), "expect": {"windows": windows_of_run}})
     )
 
 

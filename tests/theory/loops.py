@@ -19,14 +19,14 @@ RODS = {"arm.lc1_m": 0.5, "arm.lc2_m": 0.5, "arm.I1_kg_m2": 1 / 12, "arm.I2_kg_m
 
 def loop(A: Any, *delayed: tuple[float, Any]) -> LinearLoop:
     """Returns x' = A x + sum A_k x(t - T_k), without operators."""
-    own = np.atleast_2d(np.asarray(A, dtype=float))
-    n = len(own)
+    matrix = np.atleast_2d(np.asarray(A, dtype=float))
+    n = len(matrix)
     entries = [
         DelayedTerm(T, np.atleast_2d(np.asarray(Ad, dtype=float)), np.zeros((n, 0)))
         for T, Ad in delayed
     ]
     names = tuple(f"x.q{i}" for i in range(n))
-    return LinearLoop(names, (), (), own, np.zeros((n, 0)), np.zeros((0, n)), tuple(entries))
+    return LinearLoop(names, (), (), matrix, np.zeros((n, 0)), np.zeros((0, n)), tuple(entries))
 
 
 def residual(system: LinearLoop, s: complex) -> float:

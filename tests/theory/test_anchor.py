@@ -48,8 +48,8 @@ def test_the_final_pose_follows_from_the_first_estimates(
     name: str, delay_s: float, end_s: float, bar: dict[str, float]
 ) -> None:
     """The least delay is one period."""
-    made = sampled(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
-    assert np.sin(angles(made)) == pytest.approx(predicted(name, max(delay_s, PERIOD_S)), **bar)
+    end = sampled(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
+    assert np.sin(angles(end)) == pytest.approx(predicted(name, max(delay_s, PERIOD_S)), **bar)
 
 
 def test_gravity_alone_is_learnt() -> None:
@@ -63,8 +63,8 @@ def test_the_derivations_integral_is_conserved(name: str) -> None:
     """theta_hat_4 + Gamma g (sin q1 + int cos(q1) Lambda e1 dt), whatever the hands do; the
     same with q1 + q2.
     """
-    made = run(name, {"duration_s": 20.0})
-    for site in made.sites.values():
+    trajectory_of_run = run(name, {"duration_s": 20.0})
+    for site in trajectory_of_run.sites.values():
         e = site.q - site.q_des
         turned = np.stack([site.q[:, 0], site.q.sum(axis=1)], axis=1)
         power = G * np.cos(turned) * np.stack([e[:, 0], e.sum(axis=1)], axis=1)
@@ -86,13 +86,13 @@ def test_hands_see_115_nm_per_rad() -> None:
     pushed = sampled(
         load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,)
     )
-    there, from_where = angles(pushed), angles(rest)
+    pushed_angles, from_where = angles(pushed), angles(rest)
     # equal torques act on q1 + q2 alone
-    assert there[0] == pytest.approx(from_where[0], abs=2e-3)
+    assert pushed_angles[0] == pytest.approx(from_where[0], abs=2e-3)
     # no error: nothing is felt
     assert np.abs(pushed[:, -1, :2] - pushed[:, -1, 4:6]).max() < 1e-4
-    middle = 0.5 * (there[1] + from_where[1])
-    stiffness = push_nm / 3.0 / (there[1] - from_where[1])
+    middle = 0.5 * (pushed_angles[1] + from_where[1])
+    stiffness = push_nm / 3.0 / (pushed_angles[1] - from_where[1])
     level = G**2 * 1.2
     assert level == pytest.approx(115.5, abs=0.1)
     assert stiffness == pytest.approx(level * np.cos(middle) ** 2, rel=0.01)
@@ -116,8 +116,8 @@ HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
 def test_hands_feel_loads_by_ratios_of_beta() -> None:
     """Of 5 N m on the slave: 4.79 at the expert, 16.4 at the trainee, 5.00 with all shares 1/2; 2 %."""
     b1, b2, bs = left_null_vector(load_scenario("force_sharing"))
-    made = measured("force_sharing", {}, *HELD)
-    felt = [-value(made, "push1_mean_nm", n) for n in range(len(HELD))]
+    windows = measured("force_sharing", {}, *HELD)
+    felt = [-value(windows, "push1_mean_nm", n) for n in range(len(HELD))]
     assert felt == pytest.approx([4.79, 16.4, 5.00], rel=0.02)
     assert felt == pytest.approx([LOAD_NM * bs / b1, LOAD_NM * bs / b2, LOAD_NM], rel=0.02)
     assert felt[::2] == pytest.approx([LOAD_NM * bs / b1, LOAD_NM], rel=1e-3)  # both at rest

@@ -17,8 +17,8 @@ LONG_TIMES_S = np.arange(0.05, 10.01, 0.05)
 
 def motion(rate_hz: int, times_s: Array) -> Array:
     """Returns q of the tick at each of these times, shape (3, K, 6)."""
-    made = sampled(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
-    return made[..., :6]
+    motion_at_times = sampled(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
+    return motion_at_times[..., :6]
 
 
 @pytest.mark.long

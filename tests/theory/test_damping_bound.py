@@ -83,9 +83,9 @@ def test_irreversible_shares_have_no_bound(
     scenario = position_network(alpha, d=d, delay_ms=delay_ms, masses=masses)
     assert d > 10.0 * delay_ms / 1e3 * abs(np.linalg.eigvals(alpha).real.min()) * (1.0 + 1e-9)
     assert evaluate_criterion(scenario) is None
-    found = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
-    assert found is not None
-    assert found.s.real == pytest.approx(growth_per_s, abs=1e-3)
+    rightmost = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
+    assert rightmost is not None
+    assert rightmost.s.real == pytest.approx(growth_per_s, abs=1e-3)
     assert (
         count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
     )
@@ -220,10 +220,10 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
 def test_the_bound_never_accepts_growth(seed: int, *, sharp: bool) -> None:
     """250 networks a seed: 2 to 8 sites, any shares, masses over a decade, delays to 1 s."""
     rng = np.random.default_rng(seed)
-    found = [check_network(rng, sharp=sharp) for _ in range(250)]
-    assert found.count(True) > 40
-    assert found.count(False) > 40
-    assert found.count(None) > 40
+    outcomes = [check_network(rng, sharp=sharp) for _ in range(250)]
+    assert outcomes.count(True) > 40
+    assert outcomes.count(False) > 40
+    assert outcomes.count(None) > 40
 
 
 K_PAIR, TICK_S = 50.0, 1.0 / 30.0

@@ -56,8 +56,8 @@ def test_beta_is_the_left_null_vector() -> None:
 
 def test_ones_fit_one_of_three_parameters() -> None:
     """Errata 6: alpha12 = alpha31 = 1 - alpha21, the circulant matrices."""
-    (found,) = sp.solve(list(ONES * UPSILON), [A12, A31], dict=True)
-    assert found == {A12: 1 - A21, A31: 1 - A21}
+    (solution,) = sp.solve(list(ONES * UPSILON), [A12, A31], dict=True)
+    assert solution == {A12: 1 - A21, A31: 1 - A21}
 
 
 def test_eq_22_has_the_opposite_sign() -> None:
@@ -138,11 +138,11 @@ def test_kd_may_differ_by_scalars_only() -> None:
 def test_no_weights_of_the_integrals_leave_slack() -> None:
     """Errata 7: with w_ij in the integral the remainder sums to alpha_ij (k_i - w_ij)^2 / (2 w_ij) >= 0."""
     k, w = sp.symbols("k w", positive=True)
-    own, seen = sp.symbols("own seen", real=True)
-    (best,) = sp.solve(sp.diff(k * own * seen - w * seen**2 / 2, seen), seen)
+    own_share, seen = sp.symbols("own seen", real=True)
+    (best,) = sp.solve(sp.diff(k * own_share * seen - w * seen**2 / 2, seen), seen)
     # over what the peer may have done
-    most = (k * own * seen - w * seen**2 / 2).subs(seen, best)
-    assert sp.simplify(most - k**2 * own**2 / (2 * w)) == 0
+    most = (k * own_share * seen - w * seen**2 / 2).subs(seen, best)
+    assert sp.simplify(most - k**2 * own_share**2 / (2 * w)) == 0
     assert sp.simplify(-k + k**2 / (2 * w) + w / 2 - (k - w) ** 2 / (2 * w)) == 0
 
 
@@ -231,8 +231,8 @@ LOCKED = {"m1": {"s": 1.0, "m2": 0.0}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 
 def test_locked_pairs_leave_a_zero_weight() -> None:
     """Errata 11: 1 - alpha_ij alpha_ji = 0 with shares of at most one."""
     assert list(PI.subs({A12: 0, A31: 1})) == [1, 0, 1]
-    for own in (0.2, 0.7, 0.999):
-        assert min(PI.subs({A12: 1 - own, A31: 1, A21: 0.5})) > 0
+    for share in (0.2, 0.7, 0.999):
+        assert min(PI.subs({A12: 1 - share, A31: 1, A21: 0.5})) > 0
 
 
 def test_sites_that_nobody_follows_still_settle() -> None:
@@ -240,12 +240,12 @@ def test_sites_that_nobody_follows_still_settle() -> None:
     rows = {
         f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()
     }
-    made = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
-    locked = balance(made, np.array([0.5, 0.0, 0.5])).V
+    trajectory_of_run = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
+    locked = balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
     assert np.diff(locked).max() <= 1e-6 * locked.max()
-    alone = balance(made, np.array([0.0, 1.0, 0.0])).V
+    alone = balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V
     assert np.diff(alone).max() > 1e-6 * alone.max()
-    e = np.abs(made.stack("q") - made.stack("q_des")).max(axis=(0, 2))
+    e = np.abs(trajectory_of_run.stack("q") - trajectory_of_run.stack("q_des")).max(axis=(0, 2))
     assert e[-200:].max() < 0.02 < 0.5 < e.max()
 
 

@@ -43,9 +43,9 @@ def at_rest(
 ) -> Loop:
     """Returns a scenario with all sites at rest at a pose, and its roots there."""
     scenario = load_scenario(name, changes)
-    here = {f"sites.{site}.q0_rad": list(pose) for site in scenario.names}
+    starts = {f"sites.{site}.q0_rad": list(pose) for site in scenario.names}
     scenario = load_scenario(
-        scenario, here | {f"sites.{site}.hands": [] for site in scenario.names}
+        scenario, starts | {f"sites.{site}.hands": [] for site in scenario.names}
     )
     spectrum = compute_sampled_spectrum(
         derive_operating_conditions(scenario), find_equilibrium(scenario, pose), wanted
@@ -215,11 +215,11 @@ def test_digital_pairs_may_grow_despite_continuous_damping(
     rates = {"sites.m.rate_hz": rates_hz[0], "sites.s.rate_hz": rates_hz[1]}
     control = {"law": "p_d", "K": 50.0, "d": 2.0}
     changes = {**rates, "scheme": "digital", "control": control, "link.delay_ms": 0.0}
-    found = at_rest("two_sites", changes, pose=(0.0, math.pi)).found
-    assert found.rightmost is not None
-    assert found.rightmost.s.real == pytest.approx(growth_per_s, abs=5e-4)
-    assert found.rightmost.s.imag == pytest.approx(9.9, abs=0.2)
-    assert (found.verdict, found.span_s) == ("unstable", period_s)
+    roots = at_rest("two_sites", changes, pose=(0.0, math.pi)).found
+    assert roots.rightmost is not None
+    assert roots.rightmost.s.real == pytest.approx(growth_per_s, abs=5e-4)
+    assert roots.rightmost.s.imag == pytest.approx(9.9, abs=0.2)
+    assert (roots.verdict, roots.span_s) == ("unstable", period_s)
 
 
 SINE_S = 1.4
@@ -268,10 +268,10 @@ def test_drawn_delays_grow_like_their_twins() -> None:
     assert loop.found.deviation_per_s is not None
     assert 1e-3 < loop.found.deviation_per_s < 0.02
     beside = load_scenario(loop.scenario, {"sites.s.q0_rad": [POSE[0] + 1e-7, 0.0]})
-    apart = np.hstack(
+    distances = np.hstack(
         [a - b for a, b in zip(speeds(loop.scenario), speeds(beside), strict=True)]
     )
-    first, last = (np.linalg.norm(apart[from_s * 100 :][:300]) for from_s in (2, 27))
+    first, last = (np.linalg.norm(distances[from_s * 100 :][:300]) for from_s in (2, 27))
     assert math.log(last / first) / 25.0 == pytest.approx(
         loop.growth_per_s, abs=3.0 * loop.found.deviation_per_s
     )
@@ -291,11 +291,11 @@ def test_drifting_motions_differ_from_staying_ones(
         S, {(1, 0): effect}, ("m.q1", "m.qd1", "s.q1", "s.qd1"), np.array([0, 0, 1, 1]), 0
     )
     monkeypatch.setattr(floquet, "couple_ticks", lambda *_, **__: hand_made)
-    found = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
-    assert (found.zeros, found.drifting, found.verdict) == (2, 1, "at the edge")
-    assert found.rightmost is not None
+    roots = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
+    assert (roots.zeros, roots.drifting, roots.verdict) == (2, 1, "at the edge")
+    assert roots.rightmost is not None
     exact = np.log(np.roots([1.0, -(2.0 - h * d), 1.0 - h * d + h * h * K]).astype(complex)) / h
-    assert found.rightmost.s == pytest.approx(exact[np.argmax(exact.imag)], abs=1e-6)
+    assert roots.rightmost.s == pytest.approx(exact[np.argmax(exact.imag)], abs=1e-6)
 
 
 def test_thousandfold_growth_per_tick_has_its_root() -> None:

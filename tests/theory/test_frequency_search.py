@@ -93,11 +93,11 @@ def test_an_undamped_resonance_ends_the_refinement() -> None:
 
 
 def test_remembered_answers_are_asked_once() -> None:
-    asked: list[int] = []
+    questions: list[int] = []
     Y = build_admittance(pair().loop)
 
     def counted(w: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
-        asked.append(len(w))
+        questions.append(len(w))
         return Y(w)
 
     w = build_frequency_grid(0.1, 1.0, 0.2)
@@ -105,4 +105,4 @@ def test_remembered_answers_are_asked_once() -> None:
     np.testing.assert_array_equal(cached_response(w), Y(w))
     np.testing.assert_array_equal(cached_response(w), Y(w))
     np.testing.assert_array_equal(cached_response(w[:3]), Y(w[:3]))
-    assert asked == [len(w), 3]
+    assert questions == [len(w), 3]

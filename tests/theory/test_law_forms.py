@@ -122,15 +122,15 @@ def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> No
     scenario = two_sites(variant, delay_s)
     sites = {**scenario.sites, "m": msgspec.structs.replace(scenario.sites["m"], hands=())}
     loop = loop_of(msgspec.structs.replace(scenario, sites=sites))
-    found = [
+    ratios = [
         abs(find_impedance(loop, 2j * np.pi * hz)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
-    assert found == [approximate_printed(value) for value in TABLE[variant, delay_s]]
+    assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
     exact = [
         transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 5.0)
     ]
-    assert [found[0], found[-1]] == pytest.approx(exact, rel=1e-9)
+    assert [ratios[0], ratios[-1]] == pytest.approx(exact, rel=1e-9)
 
 
 @pytest.mark.long
@@ -165,17 +165,17 @@ def test_six_channels_with_accelerations_share_as_published(
 ) -> None:
     names, alpha = ("u1", "u2", "s"), complementary_shares(a)
     shares = {
-        one: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != one}
-        for i, one in enumerate(names)
+        site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
+        for i, site in enumerate(names)
     }
     sites: dict[str, Any] = {"u1": {}, "u2": {}, "s": {"hands": [hand(0.0, 500.0, 5.0)]}}
     law = {"law": "six_channel", "K": 100.0, "B": 20.0, "acceleration": 1.0}
     loop = set_common_delay(loop_of(unit_scenario(sites, law, dominance=shares)), 0.0)
-    found = [
+    ratios = [
         abs(find_impedance(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 1.0)
     ]
-    assert found == [approximate_printed(value) for value in values]
+    assert ratios == [approximate_printed(value) for value in values]
 
 
 def solves(f: Callable[[complex], complex], s: complex) -> bool:
@@ -198,8 +198,8 @@ def test_shared_authority_has_its_springs_roots() -> None:
     a, d, K_a = 0.75, 5.0, 10.0
     names, alpha = ("u1", "u2", "s"), complementary_shares(a)
     shares = {
-        one: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != one}
-        for i, one in enumerate(names)
+        site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
+        for i, site in enumerate(names)
     }
     law = {"law": "authority", "K": K_a, "d": d}
     sites = {"u1": {}, "u2": {}, "s": {"control": {**law, "leads": False}}}

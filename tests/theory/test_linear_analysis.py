@@ -34,8 +34,8 @@ def calm() -> LinearAnalysis:
 
 @pytest.fixture(scope="module")
 def digital() -> LinearAnalysis:
-    given = ["scheme=digital", "rate_hz=100", "link.delay_ms=0"]
-    return analyse_linear_loop("paper", given, pose=POSE)
+    settings = ["scheme=digital", "rate_hz=100", "link.delay_ms=0"]
+    return analyse_linear_loop("paper", settings, pose=POSE)
 
 
 def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
@@ -92,9 +92,9 @@ def test_the_map_has_every_root_and_its_conjugate(calm: LinearAnalysis) -> None:
 
 def test_several_rates_have_roots_over_periods() -> None:
     """Two sites at 40 and 30 Hz that the continuous loop, at the mean ages, calls stable."""
-    given = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
+    settings = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
     control = {"control": {"law": "p_d", "K": 50.0, "d": 2.0}}
-    pair = load_scenario(load_scenario("two_sites", control), given)
+    pair = load_scenario(load_scenario("two_sites", control), settings)
     analysis = analyse_linear_loop(pair, pose=(0.0, math.pi))
     assert (analysis.continuous.verdict, analysis.verdict) == ("stable", "unstable")
     assert describe_linear_verdict(analysis) == (
@@ -112,8 +112,8 @@ def test_drawn_delays_state_their_roots_accuracy() -> None:
     analysis = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
     assert analysis.sampled is not None
     assert analysis.sampled.deviation_per_s is not None
-    words = f"over 30 s of the delays in use, +- {analysis.sampled.deviation_per_s:.1g} /s"
-    assert describe_linear_verdict(analysis).endswith(words)
+    phrase = f"over 30 s of the delays in use, +- {analysis.sampled.deviation_per_s:.1g} /s"
+    assert describe_linear_verdict(analysis).endswith(phrase)
     assert "mean delay in use on m2->m1" in "".join(describe_effective_delays(analysis))
 
 
@@ -133,8 +133,8 @@ def test_lasting_motions_are_separated_from_decaying() -> None:
 def test_a_line_without_losses_has_no_margin() -> None:
     """All of its roots are on the axis at any delay; a search for crossings among them would not end."""
     control = {"law": "wave", "b": 60.0, "K": 0.0}
-    given = {"scheme": "digital", "control": control}
-    analysis = analyse_linear_loop("two_sites", given, pose=POSE, ports=True)
+    settings = {"scheme": "digital", "control": control}
+    analysis = analyse_linear_loop("two_sites", settings, pose=POSE, ports=True)
     assert (analysis.verdict, analysis.margin.lossless, analysis.margin.crossings) == (
         "at the edge",
         True,

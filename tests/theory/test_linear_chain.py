@@ -88,15 +88,15 @@ class Linear(NamedTuple):
 def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
     """Returns sites that start at the pose, or off it by (2, 6) rad."""
     start = POSE + (np.zeros((2, 6)) if off is None else off)
-    given = {
+    keys = {
         "control": LAWS[law],
         "sites.m.q0_rad": start[0].tolist(),
         "sites.s.q0_rad": start[1].tolist(),
     }
-    plain = parse_scenario(TEXT, "six", given | overrides, ARMS)
+    plain = parse_scenario(TEXT, "six", keys | overrides, ARMS)
     theta = plain.arms["m"].theta.tolist()
     learns = {"control": {**LAWS[law], "theta_hat0": theta}} if law == "adaptive" else {}
-    scenario = parse_scenario(TEXT, "six", given | overrides | learns, ARMS)
+    scenario = parse_scenario(TEXT, "six", keys | overrides | learns, ARMS)
     return Linear(
         scenario, derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
@@ -157,8 +157,11 @@ def test_rates_and_derivatives_equal_compiled_leaves() -> None:
     for _ in range(3):
         x = rng.uniform(-1.0, 1.0, at.arguments)
         rates, exact = evaluate_site_rates(site, x), differentiate_site_rates(site, x)
-        found, wanted = np.concatenate([rates.qdd, rates.estimate]), by_leaves(site, x, at)
-        assert np.abs(found - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
+        derivatives, wanted = (
+            np.concatenate([rates.qdd, rates.estimate]),
+            by_leaves(site, x, at),
+        )
+        assert np.abs(derivatives - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
         jacobian = np.vstack([exact.qdd, exact.estimate])
         for k in range(at.arguments):
             off = 1e-5 * np.eye(at.arguments)[k]
@@ -234,10 +237,10 @@ def test_a_run_follows_the_delay_equation(law: str) -> None:
         )
         pieces.append(done.sol)
     places = [loop.names.index(f"{site}.q{joint + 1}") for site in "ms" for joint in range(6)]
-    made = follow(case.scenario, 500) - np.tile(POSE, 2)
+    motion_of_run = follow(case.scenario, 500) - np.tile(POSE, 2)
     for k in range(100, 501, 100):
         wanted = pieces[min(1 + (k - 1) // 50, 10)](1e-3 * k)[places]
-        assert np.abs(made[k - 1] - wanted).max() <= 3e-4 * np.abs(wanted).max(), k
+        assert np.abs(motion_of_run[k - 1] - wanted).max() <= 3e-4 * np.abs(wanted).max(), k
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -252,10 +255,10 @@ def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
     case = six(law, rate_hz=200, **pushed)
     spectrum = compute_sampled_spectrum(case.conditions, case.rest, 2)
     assert spectrum is not None
-    root, following = (one.s for one in spectrum.roots)
+    root, following = (root_found.s for root_found in spectrum.roots)
     from_s = 6.0 / (root.real - following.real)  # by then the next mode has a part in 400 left
-    made = follow(case.scenario, round(200 * (from_s + 2.0)))
-    late = np.diff(made[round(200 * from_s) :: 10, 1])
+    motion_of_run = follow(case.scenario, round(200 * (from_s + 2.0)))
+    late = np.diff(motion_of_run[round(200 * from_s) :: 10, 1])
     (a, b), *_ = np.linalg.lstsq(np.column_stack([late[1:-1], late[:-2]]), late[2:], rcond=None)
     z = np.roots([1.0, -a, -b])
     s = np.log(z[np.argmax(z.imag)].astype(complex)) / (10 / 200)
@@ -281,8 +284,8 @@ def test_joints_answer_sinusoids_by_their_admittance() -> None:
     turned = w_rad_s * (late + 1) / rate_hz
     columns = np.column_stack([np.sin(turned), np.cos(turned), np.ones_like(turned), turned])
     sine, cosine, *_ = np.linalg.lstsq(columns, made[late], rcond=None)[0]
-    found = 1j * w_rad_s * (sine + 1j * cosine) / amplitude_nm
-    assert np.abs(found - Y).max() <= 0.01 * np.abs(Y).max()
+    admittance = 1j * w_rad_s * (sine + 1j * cosine) / amplitude_nm
+    assert np.abs(admittance - Y).max() <= 0.01 * np.abs(Y).max()
 
 
 def test_six_joint_laws_are_passive_in_r() -> None:
@@ -292,8 +295,8 @@ def test_six_joint_laws_are_passive_in_r() -> None:
     assert ports.estimates_true
     assert ports.proof is not None
     assert ports.proof.passive
-    assert [joint for joint, one in ports.joints.items() if not one.passive] == LOADED
-    assert [one.joint for one in ports.transparency] == [1, 2, 3, 4, 5, 6]
+    assert [joint for joint, port in ports.joints.items() if not port.passive] == LOADED
+    assert [transparency.joint for transparency in ports.transparency] == [1, 2, 3, 4, 5, 6]
     assert len(ports.two_ports) == 6
     assert (
         sum("joint 2, 3, 4, 5, 6: fails within" in line for line in describe_ports(ports)) == 1

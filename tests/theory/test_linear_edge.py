@@ -38,15 +38,15 @@ def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float
     """
     rest = predict_equilibrium(scenario)
     theta = scenario.arms["s"].theta
-    found = []
+    dampings = []
     for mass in eigvalsh(np.array(inertia(theta, rest.q[0]))):
 
         def balance(w: float, mass: float = mass) -> float:
             return mass * w * w - K * (1 + share * math.cos(w * T))
 
         w = brentq(balance, 1e-9, math.sqrt(K * (1 + share) / mass))
-        found.append(share * K * math.sin(w * T) / w)
-    return max(found)
+        dampings.append(share * K * math.sin(w * T) / w)
+    return max(dampings)
 
 
 @pytest.mark.parametrize(("name", "share"), [("p_d_margin", 0.5), ("p_d_margin_two", 1.0)])
@@ -57,13 +57,13 @@ def test_p_d_turns_stable_with_its_mode(name: str, share: float, delay_ms: float
     scenario = load_scenario(name, {"link.delay_ms": delay_ms})
     T = delay_ms / 1e3
     line = share * 10.0 * T
-    found = next(
+    edge = next(
         iterate_linear_edges(scenario, "control.d", 0.3 * line, 1.5 * line, points=8), None
     )
-    assert found is not None
-    assert found.stable_above
-    assert found.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
-    assert found.value < line  # the line leaves the inertia out: it is on the safe side
+    assert edge is not None
+    assert edge.stable_above
+    assert edge.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
+    assert edge.value < line  # the line leaves the inertia out: it is on the safe side
 
 
 def heavy_pair(
@@ -101,11 +101,11 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
         return (K2 + both * math.sqrt(d2 / d1)) / (K1 + both * math.sqrt(d1 / d2))
 
     scenario, (*_, d2) = heavy_pair(seed, worst)
-    found = next(
+    edge = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3), None
     )
-    assert found is not None
-    assert found.value == pytest.approx(d2, rel=1e-3)
+    assert edge is not None
+    assert edge.value == pytest.approx(d2, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -115,13 +115,13 @@ def test_two_like_arms_need_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
     scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_, **__: 1.0)
     exact = K1 * (T - d1 / K2)
-    found = next(
+    edge = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3),
         None,
     )
-    assert found is not None
-    assert found.value == pytest.approx(exact, rel=1e-3)
-    assert found.value <= d2 * 1.001
+    assert edge is not None
+    assert edge.value == pytest.approx(exact, rel=1e-3)
+    assert edge.value <= d2 * 1.001
 
 
 @pytest.mark.long
@@ -129,10 +129,10 @@ def test_digital_controllers_have_a_least_rate() -> None:
     """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
     scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})
     rest = find_equilibrium(scenario, (-0.1729, 0.0874))
-    found = next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6), None)
-    assert found is not None
-    assert 100 < found.value < 125
-    assert found.stable_above
+    edge = next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6), None)
+    assert edge is not None
+    assert 100 < edge.value < 125
+    assert edge.stable_above
     assert (
         next(
             iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False),
@@ -146,10 +146,10 @@ def test_digital_controllers_have_a_least_rate() -> None:
 def test_every_existing_edge_is_found() -> None:
     scenario = load_scenario("p_d_margin")
     assert next(iterate_linear_edges(scenario, "control.d", 1.2, 3.0, points=4), None) is None
-    found = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
-    assert [one.stable_above for one in found] == [False, True, False, True][: len(found)]
-    assert all(isinstance(one, LinearEdge) for one in found)
-    assert 200 < found[0].value < 230
+    edges = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
+    assert [edge.stable_above for edge in edges] == [False, True, False, True][: len(edges)]
+    assert all(isinstance(edge, LinearEdge) for edge in edges)
+    assert 200 < edges[0].value < 230
 
 
 @pytest.mark.parametrize(
@@ -187,17 +187,17 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
 
 @pytest.mark.long
 def test_an_edge_is_where_the_sign_changes() -> None:
-    (found,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
+    (crossing,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
     assert remark == ""
-    places = (found - 1e-4, found + 1e-4)
+    places = (crossing - 1e-4, crossing + 1e-4)
     (below, above), edges, _ = compute_growth_column(
         [*map(damped, places)], "control.d", places
     )
     assert below > 0.0 > above
-    assert edges == {0: pytest.approx(found, rel=1e-6)}
+    assert edges == {0: pytest.approx(crossing, rel=1e-6)}
     alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
     assert alone is not None
-    assert found == pytest.approx(alone.value, rel=1e-6)
+    assert crossing == pytest.approx(alone.value, rel=1e-6)
 
 
 def test_the_scheme_decides_the_loop() -> None:
@@ -207,10 +207,10 @@ def test_the_scheme_decides_the_loop() -> None:
         load_scenario("free", {**slow, "scheme": scheme})
         for scheme in ("second_order", "digital")
     ]
-    found = [compute_growth_column([one], "link.delay_ms", (0.0,)) for one in schemes]
-    (continuous,), (digital,) = (one.growth_per_s for one in found)
+    columns = [compute_growth_column([one], "link.delay_ms", (0.0,)) for one in schemes]
+    (continuous,), (digital,) = (column.growth_per_s for column in columns)
     assert continuous < 0.0 < digital
-    assert found[0].remarks == found[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
+    assert columns[0].remarks == columns[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
 
 
 def test_nonlinear_loops_are_reported_as_unknown() -> None:

@@ -98,7 +98,7 @@ def cartesian(law: str, space: str) -> Scenario:
 @pytest.mark.parametrize("law", LAWS)
 def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
     """Of arms that slide along x, y and z the Jacobian is 1: loop, roots, sampled roots, and ports."""
-    found = []
+    loops = []
     for space in ("joints", "position"):
         scenario = cartesian(law, space)
         rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
@@ -109,8 +109,8 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
         Y = build_admittance(linearise_teleoperator(conditions, rest))(
             np.array([0.1, 3.0, 40.0])
         )
-        found.append((rest.q, loop, spectrum, sampled, Y))
-    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = found
+        loops.append((rest.q, loop, spectrum, sampled, Y))
+    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = loops
     assert q_task == pytest.approx(q, abs=1e-12)
     assert loop_task.names == loop.names
     assert (other.zeros, other.drifting) == (one.zeros, one.drifting)
@@ -151,8 +151,8 @@ def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> 
     for k in range(1, steps + 1):
         run.advance_to(k * step_s)
         rows.append((run.q - rest.q).ravel())
-    made = np.array(rows)
-    return made[:, made.any(axis=0)]
+    motion = np.array(rows)
+    return motion[:, motion.any(axis=0)]
 
 
 def realise(outputs: Array, step_s: float, order: int) -> Array:
@@ -206,9 +206,9 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     )
     X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
     X[torques] = (whole @ X)[torques]
-    made = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
+    motion_of_run = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
     places = [names.index(angle) for angle in angles]
-    for row in made:
+    for row in motion_of_run:
         X = whole @ X
         assert np.abs(X[places] - row).max() <= 2e-5 * size
 
@@ -262,9 +262,11 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     analysis = analyse_linear_loop(scenario, pose=pose)
     end = analysis.margin.intervals[0].high
     assert end is not None
-    there = compute_delay_spectrum(set_common_delay(analysis.loop, end.delay_s), 1).rightmost
-    assert there is not None
-    assert there.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
+    rightmost = compute_delay_spectrum(
+        set_common_delay(analysis.loop, end.delay_s), 1
+    ).rightmost
+    assert rightmost is not None
+    assert rightmost.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
     edge = next(
         iterate_linear_edges(scenario, "control.d", 2.0, 20.0, analysis.rest, points=5), None
     )

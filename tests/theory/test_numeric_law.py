@@ -81,10 +81,12 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     rest = find_equilibrium(ours, POSE)
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
-    found = roots(compute_sampled_spectrum(derive_operating_conditions(theirs), same))
+    roots_of_memory = roots(compute_sampled_spectrum(derive_operating_conditions(theirs), same))
     known = roots(compute_sampled_spectrum(derive_operating_conditions(ours), rest))
     same_bits = scheme == "second_order"
-    assert np.allclose(found[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2)
+    assert np.allclose(
+        roots_of_memory[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2
+    )
 
 
 def test_unlinearised_features_are_refused() -> None:

@@ -66,8 +66,8 @@ def test_three_sites_pair_with_the_third_free() -> None:
 
 def test_hands_feel_the_slave_by_default() -> None:
     assert [
-        (one.operator_site, one.other_site, one.joint)
-        for one in section_of("p_d_margin").transparency
+        (transparency.operator_site, transparency.other_site, transparency.joint)
+        for transparency in section_of("p_d_margin").transparency
     ] == [
         ("m1", "s", 1),
         ("m1", "s", 2),
@@ -75,8 +75,8 @@ def test_hands_feel_the_slave_by_default() -> None:
         ("m2", "s", 2),
     ]
     assert {
-        (one.operator_site, one.other_site)
-        for one in section_of("p_d_margin", of="m1").transparency
+        (transparency.operator_site, transparency.other_site)
+        for transparency in section_of("p_d_margin", of="m1").transparency
     } == {
         ("m2", "m1"),
         ("s", "m1"),

@@ -50,9 +50,9 @@ def test_masses_springs_and_dampers_are_passive(
     wires = [
         Wire(a, b, K, B) for n, (K, B) in enumerate(links) for a, b in ((n, n + 1), (n + 1, n))
     ]
-    found = judge_passivity(Network(m, d, k, tuple(wires)))
-    assert found.passive
-    assert found.lacking_nm_s_rad == 0.0
+    passivity = judge_passivity(Network(m, d, k, tuple(wires)))
+    assert passivity.passive
+    assert passivity.lacking_nm_s_rad == 0.0
 
 
 @settings(max_examples=20, deadline=None)
@@ -183,14 +183,14 @@ def test_a_loads_impedance_adds_at_its_port(K: float, B: float) -> None:
 @pytest.mark.parametrize("site", ["a", "b", "c"])
 def test_a_clamp_leaves_the_rest_of_the_impedance(site: str) -> None:
     """Also if the clamp's own torque is reflected, and comes back by two delays."""
-    place = "abc".index(site)
-    keep = [n for n in range(3) if n != place]
+    index = "abc".index(site)
+    keep = [n for n in range(3) if n != index]
     clamped = clamp_site(REFLECTING.loop, site)
     assert clamped.inputs == tuple(f"{name}.tau1" for name in "abc" if name != site)
     assert not any(name.startswith(f"{site}.") for name in clamped.names)
     Y = build_admittance(REFLECTING.loop)(W)
     np.testing.assert_allclose(
-        build_admittance(clamped)(W), clamp_ports(Y, keep, [place]), rtol=1e-8, atol=1e-12
+        build_admittance(clamped)(W), clamp_ports(Y, keep, [index]), rtol=1e-8, atol=1e-12
     )
 
 

@@ -147,16 +147,22 @@ def test_felt_p_d_impedance_is_as_on_paper(
     Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance.
     """
     network = pair((K, K), d, T)
-    (found,) = measure_transparency(network.loop, "a", "b")
-    S = 1j * found.w_rad_s
-    own, other = (m * S + damping + K / S for m, damping in zip(network.m, d, strict=True))
+    (transparency,) = measure_transparency(network.loop, "a", "b")
+    S = 1j * transparency.w_rad_s
+    own_impedance, other = (
+        m * S + damping + K / S for m, damping in zip(network.m, d, strict=True)
+    )
     through = (K / S) ** 2 * np.exp(-S * sum(T))
-    np.testing.assert_allclose(found.clamped, own, rtol=1e-8)
-    np.testing.assert_allclose(found.free, own - through / other, rtol=1e-8)
+    np.testing.assert_allclose(transparency.clamped, own_impedance, rtol=1e-8)
+    np.testing.assert_allclose(transparency.free, own_impedance - through / other, rtol=1e-8)
     # the Z-width -h12 h21 / h22
-    inside = (found.w_rad_s >= 0.2 * np.pi) & (found.w_rad_s <= 20.0 * np.pi)
+    inside = (transparency.w_rad_s >= 0.2 * np.pi) & (transparency.w_rad_s <= 20.0 * np.pi)
     sizes = np.abs(through / other)[inside]
-    assert sizes.min() * (1.0 - 1e-6) <= found.difference_nm_s_rad <= sizes.max() * (1.0 + 1e-6)
+    assert (
+        sizes.min() * (1.0 - 1e-6)
+        <= transparency.difference_nm_s_rad
+        <= sizes.max() * (1.0 + 1e-6)
+    )
 
 
 def test_the_third_sites_holder_counts() -> None:
@@ -198,8 +204,10 @@ def test_the_width_grows_with_coupling_stiffness() -> None:
 
 
 def test_two_sites_that_do_not_couple_feel_nothing() -> None:
-    (one,) = measure_transparency(Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b")
-    assert one.ratio_db == pytest.approx(0.0, abs=1e-12)
+    (transparency,) = measure_transparency(
+        Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b"
+    )
+    assert transparency.ratio_db == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(

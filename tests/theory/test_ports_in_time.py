@@ -25,8 +25,8 @@ def fitted(t_s: Array, values: Array, w_rad_s: float) -> Complex:
     columns = np.column_stack(
         [np.sin(w_rad_s * t_s), np.cos(w_rad_s * t_s), np.ones_like(t_s), t_s]
     )
-    found = np.linalg.lstsq(columns, values, rcond=None)[0]
-    return np.asarray(found[0] + 1j * found[1], dtype=np.complex128)
+    solution = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return np.asarray(solution[0] + 1j * solution[1], dtype=np.complex128)
 
 
 def measure_admittance(
@@ -61,9 +61,9 @@ def test_p_d_answers_sinusoids_by_its_admittance(hz: float, joint: int) -> None:
             derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
         )
     )(np.array([2.0 * np.pi * hz]))[0]
-    found = measure_admittance("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
-    assert np.abs(found - Y[:, joint - 1]).max() < 0.01 * np.abs(Y[:, joint - 1]).max()
-    assert (np.abs(found - Y[:, joint - 1]) < 0.01 * np.abs(Y[:, joint - 1])).all()
+    admittance = measure_admittance("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
+    assert np.abs(admittance - Y[:, joint - 1]).max() < 0.01 * np.abs(Y[:, joint - 1]).max()
+    assert (np.abs(admittance - Y[:, joint - 1]) < 0.01 * np.abs(Y[:, joint - 1])).all()
 
 
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
@@ -91,7 +91,7 @@ def test_paper_law_answers_by_its_admittance(hz: float) -> None:
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
     Y = build_admittance(hold_by_spring(bare, "m", 20.0, 3.0))(np.array([2.0 * np.pi * hz]))[0]
-    found = measure_admittance(
+    admittance = measure_admittance(
         "two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0
     )
-    assert (np.abs(found - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()
+    assert (np.abs(admittance - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()

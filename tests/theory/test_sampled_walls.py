@@ -41,10 +41,10 @@ def edge(B: float = 0.0, b: float = 0.0) -> LinearEdge | None:
 
 @pytest.mark.long
 def test_the_map_in_contact_has_its_edge() -> None:
-    found = edge()
-    assert found is not None
-    assert found.value == pytest.approx(15.5e3, rel=0.005)
-    assert not found.stable_above
+    edge_found = edge()
+    assert edge_found is not None
+    assert edge_found.value == pytest.approx(15.5e3, rel=0.005)
+    assert not edge_found.stable_above
 
 
 @pytest.mark.long
@@ -63,8 +63,8 @@ def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:
     J = np.array([-np.sin(q1) - np.sin(q1 + q2), -np.sin(q1 + q2)])
     own = b / float(J @ J)
     bound = 2.0 * 1000.0 * (own - B)
-    found = edge(B, b)
-    assert found is None or found.value > bound > 0.0
+    edge_found = edge(B, b)
+    assert edge_found is None or edge_found.value > bound > 0.0
 
 
 def classify_stiffness(K: float) -> CellClass:
@@ -80,12 +80,12 @@ def end_alone(K: float) -> Stability:
 @pytest.mark.long
 def test_runs_have_the_edge_of_the_map() -> None:
     """Stable 5 % below the edge, and not 5 % above, which shows without the map too."""
-    found = edge()
-    assert found is not None
-    assert classify_stiffness(0.95 * found.value) is CellClass.CONVERGED
-    assert classify_stiffness(1.05 * found.value) is not CellClass.CONVERGED
-    assert end_alone(0.95 * found.value) is Stability.SETTLED
-    assert end_alone(1.05 * found.value) is Stability.NOT_STABLE
+    edge_found = edge()
+    assert edge_found is not None
+    assert classify_stiffness(0.95 * edge_found.value) is CellClass.CONVERGED
+    assert classify_stiffness(1.05 * edge_found.value) is not CellClass.CONVERGED
+    assert end_alone(0.95 * edge_found.value) is Stability.SETTLED
+    assert end_alone(1.05 * edge_found.value) is Stability.NOT_STABLE
 
 
 @pytest.mark.long
@@ -202,11 +202,11 @@ def test_six_joints_in_contact_grow_like_pinocchios_arm(n: int) -> None:
         scenario = press(state, K)
         at = np.tile(state.q, (2, 1))
         theta = np.zeros((3, 2, 60))
-        away = at + np.linalg.pinv(state.jacobian[:3]) @ (2.0 * FORCE_N / K * NORMAL)
+        away_m = at + np.linalg.pinv(state.jacobian[:3]) @ (2.0 * FORCE_N / K * NORMAL)
         wanted = growth_of_ticks(state, K)
         assert find_contact_growth(
-            scenario, np.stack([away, at, away]), theta
+            scenario, np.stack([away_m, at, away_m]), theta
         ) == pytest.approx(wanted, rel=1e-5)
-        assert np.isnan(find_contact_growth(scenario, away[None], theta[:1]))
+        assert np.isnan(find_contact_growth(scenario, away_m[None], theta[:1]))
         signs.add(wanted > 0.0)
     assert signs == {True, False}

@@ -105,8 +105,8 @@ def test_the_papers_hands_hardly_move_joint_1() -> None:
 
 @pytest.mark.long
 def test_without_a_box_the_slave_returns() -> None:
-    made = measured("box", NO_BOX)
-    assert made.end_pose_rad["s"] == (
+    windows = measured("box", NO_BOX)
+    assert windows.end_pose_rad["s"] == (
         approximate_figure(-0.011, 1e-3),
         approximate_figure(0.005, 1e-3),
     )
@@ -114,9 +114,9 @@ def test_without_a_box_the_slave_returns() -> None:
 
 @pytest.mark.long
 def test_truth_on_edge_of_box_lets_them_sag() -> None:
-    made = measured("box", {**EDGE, "duration_s": 20.0})
-    assert made.end_pose_rad["s"][0] < -0.4
-    assert made.end_pose_rad["s"][1] < -0.7
+    windows = measured("box", {**EDGE, "duration_s": 20.0})
+    assert windows.end_pose_rad["s"][0] < -0.4
+    assert windows.end_pose_rad["s"][1] < -0.7
 
 
 @pytest.mark.long
@@ -124,8 +124,8 @@ def test_truth_on_edge_of_box_lets_them_sag() -> None:
 def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) -> None:
     row = {"m1": share, "m2": 1.0 - share}
     overrides: Overrides = {"timeline": [], "dominance.s": row, "duration_s": 10.0}
-    made = measured("training", overrides, (9.9, 10.0, "s"))
-    assert value(made, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
+    windows = measured("training", overrides, (9.9, 10.0, "s"))
+    assert value(windows, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
 
 
 HEALED = (6.0, 15.0, "s")
@@ -133,10 +133,10 @@ HEALED = (6.0, 15.0, "s")
 
 @pytest.mark.long
 def test_healing_links_kick_slaves_that_continued() -> None:
-    made = measured("outage", {}, HEALED)
-    assert value(made, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
-    assert value(made, "torque_peak_nm") == approximate_figure(35.0, 1.0)
-    assert made.synchronised_at_s == approximate_figure(12.4, 0.1)
+    windows = measured("outage", {}, HEALED)
+    assert value(windows, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
+    assert value(windows, "torque_peak_nm") == approximate_figure(35.0, 1.0)
+    assert windows.synchronised_at_s == approximate_figure(12.4, 0.1)
     uncut = measured("outage", {"link.outages_s": []}, HEALED)
     assert value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
 
@@ -153,31 +153,31 @@ LATE = (9.0, 15.0, "s")
 
 
 def test_direct_force_reflection_hammers_at_200_ms() -> None:
-    made = measured("contact", {}, LATE)
-    assert value(made, "wall_mean_n") == approximate_figure(8.0, 1.0)
-    assert value(made, "wall_deviation_n") == approximate_figure(14.0, 1.0)
-    assert value(made, "wall_peak_n") == approximate_figure(52.0, 1.0)
-    assert value(made, "wall_hits") == 3
+    windows = measured("contact", {}, LATE)
+    assert value(windows, "wall_mean_n") == approximate_figure(8.0, 1.0)
+    assert value(windows, "wall_deviation_n") == approximate_figure(14.0, 1.0)
+    assert value(windows, "wall_peak_n") == approximate_figure(52.0, 1.0)
+    assert value(windows, "wall_hits") == 3
 
 
 def test_at_20_ms_there_is_one_hit() -> None:
-    made = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
-    assert value(made, "wall_hits") == 1
-    assert value(made, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
-    assert value(made, "wall_deviation_n", 1) < 0.01
+    windows = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
+    assert value(windows, "wall_hits") == 1
+    assert value(windows, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
+    assert value(windows, "wall_deviation_n", 1) < 0.01
 
 
 def test_a_fifth_of_the_force_settles() -> None:
-    made = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
-    assert value(made, "wall_mean_n") == approximate_figure(8.5, 0.1)
-    assert value(made, "wall_deviation_n") < 0.05
+    windows = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
+    assert value(windows, "wall_mean_n") == approximate_figure(8.5, 0.1)
+    assert value(windows, "wall_deviation_n") < 0.05
 
 
 def test_free_motion_is_calm_at_200_ms() -> None:
-    made = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
-    assert value(made, "speed_peak_rad_s") < 1e-6
-    assert made.end_error_rad is not None
-    assert made.end_error_rad < 1e-6
+    windows = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
+    assert value(windows, "speed_peak_rad_s") < 1e-6
+    assert windows.end_error_rad is not None
+    assert windows.end_error_rad < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -190,25 +190,25 @@ def test_free_motion_is_calm_at_200_ms() -> None:
 )
 def test_position_laws_pass_the_same_wall(law: dict[str, object]) -> None:
     """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
-    made = measured(
+    windows = measured(
         "contact",
         {"control": law, "sites.m.control": {}, "sites.s.control": {}, "duration_s": 25.0},
         (24.0, 25.0, "s"),
     )
-    assert value(made, "wall_mean_n") > 1.0
-    assert value(made, "wall_deviation_n") < 0.05
+    assert value(windows, "wall_mean_n") > 1.0
+    assert value(windows, "wall_deviation_n") < 0.05
 
 
 @pytest.mark.long
 def test_without_learning_gravity_nothing_winds_up() -> None:
-    made = measured(
+    windows = measured(
         "windup",
         {"control.Gamma": [1.0, 1.0, 1.0, 0.0, 0.0], "duration_s": 20.0},
         (10.0, 10.2, "s"),
         (19.8, 20.0, "s"),
     )
-    assert value(made, "wall_mean_n", 1) == pytest.approx(
-        value(made, "wall_mean_n", 0), abs=0.02
+    assert value(windows, "wall_mean_n", 1) == pytest.approx(
+        value(windows, "wall_mean_n", 0), abs=0.02
     )
 
 
@@ -241,8 +241,10 @@ A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force th
 def test_window_limits_are_figures_within_bars(
     name: str, key: str, window: tuple[float, float], figure: float, digit: float
 ) -> None:
-    asked = {(w.from_s, w.to_s): dict(w.limits) for w in load_scenario(name).expect.windows}
-    least, most = asked[window][key]
+    limits_by_window = {
+        (w.from_s, w.to_s): dict(w.limits) for w in load_scenario(name).expect.windows
+    }
+    least, most = limits_by_window[window][key]
     bar = max(digit, 0.02 * abs(figure))
     assert figure - bar <= least + 1e-12
     assert most <= figure + bar + 1e-12
@@ -315,8 +317,8 @@ def test_unequal_shares_have_their_own_margin() -> None:
 def test_half_of_the_margin_grows_to_10_rad() -> None:
     faster_arms = {"limits.qd_limit_rad_s": 100.0}
     changes = {"control.d": 0.5, "duration_s": 40.0, **faster_arms}
-    made = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
-    assert [peak(made, 0), peak(made, 1)] == [
+    windows = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
+    assert [peak(windows, 0), peak(windows, 1)] == [
         approximate_figure(1.6, 0.1),
         approximate_figure(10.0, 1.0),
     ]
@@ -324,8 +326,8 @@ def test_half_of_the_margin_grows_to_10_rad() -> None:
 
 @pytest.mark.long
 def test_two_and_half_margins_decay_to_milliradians() -> None:
-    made = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
-    assert peak(made) == approximate_figure(3e-3, 1e-3)
+    windows = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
+    assert peak(windows) == approximate_figure(3e-3, 1e-3)
 
 
 @pytest.mark.long

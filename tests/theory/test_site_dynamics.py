@@ -73,15 +73,15 @@ def by_leaves(site_setup: SiteSetup, x: Array) -> dict[str, Array]:
 @given(seed=seeds, law=laws)
 def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
-    one = site(rng, law, actors(rng))
+    random_site = site(rng, law, actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
-    site_rates, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
+    site_rates, wanted = evaluate_site_rates(random_site, x), by_leaves(random_site, x)
     for name, value in wanted.items():
         scale = 1.0 + max(
             np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()
         )
         inverse = (
-            np.abs(differentiate_site_rates(one, x).qdd[:, AT.external_torque]).max()
+            np.abs(differentiate_site_rates(random_site, x).qdd[:, AT.external_torque]).max()
             if name == "qdd"
             else 1.0
         )
@@ -95,13 +95,15 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
 def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     """Away from the surfaces of walls, where no derivative exists."""
     rng = np.random.default_rng(seed)
-    one = site(rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL])
+    random_site = site(
+        rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL]
+    )
     x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
-    derivatives = differentiate_site_rates(one, x)
+    derivatives = differentiate_site_rates(random_site, x)
     for k in range(AT.arguments):
         ahead, behind = (
-            evaluate_site_rates(one, x + sign * step * np.eye(AT.arguments)[k])
+            evaluate_site_rates(random_site, x + sign * step * np.eye(AT.arguments)[k])
             for sign in (1, -1)
         )
         for name in derivatives._fields:
@@ -117,40 +119,46 @@ def test_walls_push_on_one_side_only() -> None:
     wall = TorqueSource(
         TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0)
     )
-    one = site(rng, "known", [wall])
+    wall_site = site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
     assert not evaluate_site_rates(
-        one, x
+        wall_site, x
     ).external.any()  # the stretched arm is on the free side
     x[AT.q] = np.pi, 0.0
-    assert evaluate_site_rates(one, x).external[0] == pytest.approx(0.0, abs=1e-12)  # no lever
+    assert evaluate_site_rates(wall_site, x).external[0] == pytest.approx(
+        0.0, abs=1e-12
+    )  # no lever
     x[AT.q] = 2.5, 0.1
-    assert np.abs(evaluate_site_rates(one, x).external).max() > 1.0
+    assert np.abs(evaluate_site_rates(wall_site, x).external).max() > 1.0
     outward = np.sign(
         evaluate_site_rates(
-            one, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)
+            wall_site, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)
         ).external[0]
     )
     x[AT.qd] = outward * 1e3, 0.0
     assert not evaluate_site_rates(
-        one, x
+        wall_site, x
     ).external.any()  # faster outward than the spring would push
 
 
 def test_estimates_never_leave_their_box_and_return() -> None:
     rng = np.random.default_rng(2)
-    one = site(rng, "adaptive")
+    adaptive_site = site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)
-    free = evaluate_site_rates(one, x).estimate
+    free = evaluate_site_rates(adaptive_site, x).estimate
     ends = (
         np.where(free > 0, x[AT.estimate], np.inf),
         np.where(free > 0, -np.inf, x[AT.estimate]),
     )
-    held = one._replace(gains=one.gains._replace(high=tuple(ends[0]), low=tuple(ends[1])))
+    held = adaptive_site._replace(
+        gains=adaptive_site.gains._replace(high=tuple(ends[0]), low=tuple(ends[1]))
+    )
     assert not evaluate_site_rates(held, x).estimate.any()
     assert not differentiate_site_rates(held, x).estimate.any()
-    back = one._replace(
-        gains=one.gains._replace(low=tuple(np.where(free > 0, x[AT.estimate], -np.inf)))
+    back = adaptive_site._replace(
+        gains=adaptive_site.gains._replace(
+            low=tuple(np.where(free > 0, x[AT.estimate], -np.inf))
+        )
     )
     assert (evaluate_site_rates(back, x).estimate == free).all()
 
@@ -158,10 +166,10 @@ def test_estimates_never_leave_their_box_and_return() -> None:
 def test_states_exactly_on_edges_are_reported() -> None:
     rng = np.random.default_rng(3)
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0))
-    one = site(rng, "known", [wall])
+    wall_site = site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
-    assert not list(describe_switching_points(one, x))
-    on = one._replace(actors=(wall._replace(a=(sum(one.lengths_m), 0.0)),))
+    assert not list(describe_switching_points(wall_site, x))
+    on = wall_site._replace(actors=(wall._replace(a=(sum(wall_site.lengths_m), 0.0)),))
     assert list(describe_switching_points(on, x)) == [
         "x rests exactly on the surface of its wall 1: it counts as not touching"
     ]

@@ -53,11 +53,11 @@ def jacobian(q: Vector) -> Vector:
 
 def regressor(q: Vector, qd: Vector, v: Vector, a: Vector) -> Vector:
     """Returns M a + C v + G of the textbook, C of Christoffel's symbols, as a matrix of its parameters."""
-    c, s, one, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
+    c, s, single, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
     first = 2 * c * a[0] + c * a[1] - s * (qd[1] * v[0] + (qd[0] + qd[1]) * v[1])
     return np.array(
         [
-            [a[0], first, a[1], one, both],
+            [a[0], first, a[1], single, both],
             [0.0, c * a[0] + s * qd[0] * v[0], a[0] + a[1], 0.0, both],
         ]
     )
@@ -159,8 +159,8 @@ def test_beta_of_ones_usually_fails() -> None:
     (20), which is the right null vector, not the left one. Ones work only if columns sum to
     one.
     """
-    made = run("asymmetric", {"duration_s": DURATION_S})
-    assert balance(made, np.full(3, 1 / 3)).residual > 1e-2
+    trajectory_of_run = run("asymmetric", {"duration_s": DURATION_S})
+    assert balance(trajectory_of_run, np.full(3, 1 / 3)).residual > 1e-2
 
 
 @pytest.mark.parametrize("name", ["free", "paper"])
@@ -188,7 +188,7 @@ def test_scaled_kd_needs_beta_divided_alike() -> None:
         "m2": {"m1": 0.8, "s": 0.2},
         "s": {"m1": 0.8, "m2": 0.2},
     }
-    made = run(
+    trajectory_of_run = run(
         "free",
         {
             **{
@@ -201,9 +201,11 @@ def test_scaled_kd_needs_beta_divided_alike() -> None:
             "duration_s": DURATION_S,
         },
     )
-    right = balance(made, left_null_vector(made.scenario) / list(scale.values()))
+    right = balance(
+        trajectory_of_run, left_null_vector(trajectory_of_run.scenario) / list(scale.values())
+    )
     assert np.diff(right.V).max() <= 5e-8 * right.V.max()
     assert right.residual <= 5e-5
-    ones = balance(made, np.ones(3)).V
+    ones = balance(trajectory_of_run, np.ones(3)).V
     assert (ones - np.minimum.accumulate(ones)).max() == pytest.approx(12.3, abs=0.2)
     assert ones[0] == pytest.approx(32.8, abs=0.1)

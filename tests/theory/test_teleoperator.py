@@ -168,10 +168,10 @@ def test_statics_share_the_force_by_dominance() -> None:
     assert beta is not None
     Y = build_admittance(loop)(np.array([1e-5]))[0]
     slave = find_site_ports(loop, "s")
-    for place, site in enumerate(("m1", "m2")):
+    for index, site in enumerate(("m1", "m2")):
         site_ports = find_site_ports(loop, site)
         felt = np.linalg.solve(Y[np.ix_(site_ports, site_ports)], Y[np.ix_(site_ports, slave)])
-        np.testing.assert_allclose(felt.real, np.eye(2) * beta[2] / beta[place], atol=1e-3)
+        np.testing.assert_allclose(felt.real, np.eye(2) * beta[2] / beta[index], atol=1e-3)
         np.testing.assert_allclose(felt.imag, 0.0, atol=1e-3)
 
 

@@ -57,9 +57,9 @@ def test_columns_are_separate_arms(seed: int) -> None:
     theta = np.array([3.0, 1.0, 1.0, 2.0, 1.0])
     q, qd, torque = rng.normal(size=(3, 2, 4))
     each = np.zeros(4) + theta[:, None]
-    found = placed(q).joint_acceleration(each, qd, torque)
+    accelerations = placed(q).joint_acceleration(each, qd, torque)
     for n in range(4):
-        assert found[:, n] == pytest.approx(
+        assert accelerations[:, n] == pytest.approx(
             placed(q[:, n]).joint_acceleration(theta, qd[:, n], torque[:, n])
         )
 
@@ -126,12 +126,12 @@ def test_columns_are_separate_chains() -> None:
         return PlacedChain(made, q).joint_acceleration(theta, qd, tau)
 
     both = [np.stack(pair, axis=1) for pair in ((first.q, second.q), (first.qd, second.qd))]
-    found = acceleration(
+    accelerations = acceleration(
         *both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1)
     )
     for n, one in enumerate((first, second)):
         assert (
-            largest_difference(found[:, n], acceleration(one.q, one.qd, one.tau, theta))
+            largest_difference(accelerations[:, n], acceleration(one.q, one.qd, one.tau, theta))
             <= 1e-12
         )
     for k in range(7):
@@ -150,8 +150,8 @@ def test_drives_and_stops_equal_compiled_leaves(name: str) -> None:
         rows, qdd = build_chain(made.joints, 12), np.zeros(len(state.q))
         place_joints(rows, state.q)
         find_acceleration(rows, theta, state.gravity, state.q, state.qd, state.tau, qdd)
-        found = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
-        assert largest_difference(found, qdd) <= 1e-11
+        acceleration = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
+        assert largest_difference(acceleration, qdd) <= 1e-11
 
 
 def test_planar_arms_are_two_joint_chains() -> None:

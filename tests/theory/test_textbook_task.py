@@ -83,20 +83,26 @@ def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array
         rng.normal(0.0, 0.3, at.joints),
         rng.normal(0.0, 1.0, at.parameters),
     )
-    own = evaluate_site_rates(
+    own_rates = evaluate_site_rates(
         site, np.concatenate([state, np.zeros(at.arguments - at.states)])
     ).x
     peers = []
     for _ in site.links:
-        pose = own + np.concatenate([rng.normal(0.0, distance, 3), np.zeros(len(own) - 3)])
-        if len(own) > 3:
+        pose = own_rates + np.concatenate(
+            [rng.normal(0.0, distance, 3), np.zeros(len(own_rates) - 3)]
+        )
+        if len(own_rates) > 3:
             turned = Rotation.from_rotvec(rng.normal(0.0, distance, 3)) * Rotation.from_rotvec(
-                own[3:]
+                own_rates[3:]
             )
             pose[3:] = turned.as_rotvec()
         peers.append(
             np.concatenate(
-                [pose, rng.normal(0.0, 0.2, len(own)), rng.normal(0.0, 2.0, len(own))]
+                [
+                    pose,
+                    rng.normal(0.0, 0.2, len(own_rates)),
+                    rng.normal(0.0, 2.0, len(own_rates)),
+                ]
             )
         )
     return state, peers
@@ -105,8 +111,10 @@ def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array
 def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
     at, alpha = lay_out_arguments(site), np.array([0.0, *(link.alpha for link in site.links)])
     m, x = at.coordinates, np.concatenate([state, np.zeros(at.arguments - at.states)])
-    own = evaluate_site_rates(site, x).x
-    x[at.q_des] = evaluate_reference(alpha, own, [own, *(peer[:m] for peer in peers)])
+    derivative = evaluate_site_rates(site, x).x
+    x[at.q_des] = evaluate_reference(
+        alpha, derivative, [derivative, *(peer[:m] for peer in peers)]
+    )
     x[at.qd_des] = sum(a * peer[m : 2 * m] for a, peer in zip(alpha[1:], peers, strict=True))
     x[at.peer_torque] = sum(
         -a * peer[2 * m :] for a, peer in zip(alpha[1:], peers, strict=True)
@@ -120,8 +128,11 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
     """
     at, accelerations, records = lay_out_arguments(site), [], []
     for rate_hz in (10_000, 20_000):
-        one = site._replace(rate_hz=rate_hz)
-        arrays, buffers = build_site_arrays(one, pages=8), build_tick_buffers(one)
+        faster_site = site._replace(rate_hz=rate_hz)
+        arrays, buffers = (
+            build_site_arrays(faster_site, pages=8),
+            build_tick_buffers(faster_site),
+        )
         s = arrays.site[0]
         s.q, s.qd, s.theta_hat = state[at.q], state[at.qd], state[at.estimate]
         for link, peer in zip(arrays.links, peers, strict=True):
@@ -130,7 +141,8 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
         accelerations.append((s.qd - state[at.qd]) * rate_hz)
         rates = (s.theta_hat - state[at.estimate]) * rate_hz
         columns = {
-            name: buffers.record[place].copy() for name, place in one.layout.columns().items()
+            name: buffers.record[place].copy()
+            for name, place in faster_site.layout.columns().items()
         }
         records.append({**columns, "estimate": rates})
     return {**records[1], "qdd": 2.0 * accelerations[1] - accelerations[0]}
@@ -145,17 +157,17 @@ def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance:
     site = build(text, name, law)
     for seed in range(3):
         state, peers = draw(site, seed, distance)
-        found, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
-        names = {"tau": found.tau, "x": found.x, "xd": found.xd, "wrench": -found.reflected}
+        rates, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
+        names = {"tau": rates.tau, "x": rates.x, "xd": rates.xd, "wrench": -rates.reflected}
         for key, value in names.items():
             assert np.abs(value - wanted[key]).max() <= 1e-9 * (
                 1.0 + np.abs(wanted[key]).max()
             ), key
         if law == "adaptive":
-            size = 1.0 + np.abs(found.estimate).max()
-            assert np.abs(found.estimate - wanted["estimate"]).max() <= 1e-7 * size
-        size = 1.0 + np.abs(found.qdd).max()
-        assert np.abs(found.qdd - wanted["qdd"]).max() <= 2e-5 * size
+            size = 1.0 + np.abs(rates.estimate).max()
+            assert np.abs(rates.estimate - wanted["estimate"]).max() <= 1e-7 * size
+        size = 1.0 + np.abs(rates.qdd).max()
+        assert np.abs(rates.qdd - wanted["qdd"]).max() <= 2e-5 * size
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
@@ -166,8 +178,8 @@ def test_its_jacobian_is_the_difference_of_compiled_ticks(
     at = lay_out_arguments(site)
     state, peers = draw(site, 4, 0.0)
     x = np.concatenate([state, np.zeros(at.arguments - at.states)])
-    own = evaluate_site_rates(site, x).x
-    x[at.q_des], x[at.qd_des], x[at.peer_torque] = own + 0.05, 0.1, 0.3
+    derivative = evaluate_site_rates(site, x).x
+    x[at.q_des], x[at.qd_des], x[at.peer_torque] = derivative + 0.05, 0.1, 0.3
     exact = differentiate_site_rates(site, x)
     places = [*range(2 * at.joints), *range(at.states, at.inputs.stop)]
 

@@ -129,8 +129,8 @@ def start_state(
     X = np.concatenate(
         [start, np.tile(start[late], (len(whole) - len(names)) // max(1, len(late)))]
     )
-    thetas = [place for place, name in enumerate(names) if ".theta" in name]
-    taus = [place for place, name in enumerate(names) if ".tau" in name]
+    thetas = [index for index, name in enumerate(names) if ".theta" in name]
+    taus = [index for index, name in enumerate(names) if ".tau" in name]
     if uses_trapezoid:  # theta_0 = eta_0 + h/2 f_0, and a tick adds h f to eta
         X[thetas] -= 0.5 * ((whole @ X)[thetas] - X[thetas])
     if taus:
@@ -144,14 +144,14 @@ def test_sampled_loops_converge_with_their_schemes_order(
     scheme: str, order: int, delay_ms: float
 ) -> None:
     """Both with the same delay in use; the rightmost root, at rates that halve the period."""
-    apart = []
+    distances = []
     for rate_hz in (100, 200, 400):
         scenario = load_scenario(
             "paper", {"scheme": scheme, "link.delay_ms": delay_ms, "rate_hz": rate_hz}
         )
         continuous, computed = spectra(scenario, 2)
-        apart.append(abs(continuous.roots[0].s - computed.roots[0].s))
-    for coarse, fine in itertools.pairwise(apart):
+        distances.append(abs(continuous.roots[0].s - computed.roots[0].s))
+    for coarse, fine in itertools.pairwise(distances):
         assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
 
 
@@ -160,10 +160,10 @@ def test_sampled_loops_converge_with_their_schemes_order(
 )
 def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable: bool) -> None:
     """About Gamma g^2 h > Kp it oscillates by itself; the extrapolated torque does not."""
-    given = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
-    _, digital = spectra(load_scenario("paper", {"scheme": "digital", **given}))
+    changes = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
+    _, digital = spectra(load_scenario("paper", {"scheme": "digital", **changes}))
     assert (digital.verdict == "stable") == stable
-    _, second = spectra(load_scenario("paper", given))
+    _, second = spectra(load_scenario("paper", changes))
     assert second.verdict == "stable"
 
 
@@ -186,9 +186,9 @@ def test_a_growing_swing_matches_a_run() -> None:
     root = spectrum.roots[0].s
     run = trajectories(scenario).sites["m"]
     late = run.t_s > 8.0
-    apart = np.abs(run.q - run.q_des)[late, 0]
+    distance = np.abs(run.q - run.q_des)[late, 0]
     half = round(np.pi / root.imag * 50)
-    peaks = [apart[k : k + half].max() for k in range(0, len(apart) - half, half)]
+    peaks = [distance[k : k + half].max() for k in range(0, len(distance) - half, half)]
     slope, _ = np.polyfit(np.arange(len(peaks)) * half / 50, np.log(peaks), 1)
     assert slope == pytest.approx(root.real, rel=0.03)
 

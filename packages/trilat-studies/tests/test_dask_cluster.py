@@ -80,9 +80,9 @@ class Cluster:
 
 @pytest.fixture
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    made = Cluster(tmp_path_factory.mktemp("cluster"))
-    yield made
-    made.close()
+    cluster_made = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield cluster_made
+    cluster_made.close()
 
 
 def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
@@ -183,7 +183,7 @@ def test_workers_with_another_program_are_refused_even_later(
     with (tmp_path / "trilat_net" / "errors.py").open("a") as file:
         file.write("# another one\n")
     first = cluster.add_worker()
-    here = describe_worker()["source files"]
+    sources = describe_worker()["source files"]
     with open_worker_pool(None, cluster.address) as pool:
         assert pool.map(abs, [-1, -2]) == [1, 2]
         cluster.add_worker(tmp_path)
@@ -191,11 +191,11 @@ def test_workers_with_another_program_are_refused_even_later(
         first.kill()
         with pytest.raises(
             UsageError,
-            match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {here}",
+            match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {sources}",
         ):
             pool.map(abs, range(-99, 0))
     with (
-        pytest.raises(UsageError, match=f"source files .* {here}"),
+        pytest.raises(UsageError, match=f"source files .* {sources}"),
         open_worker_pool(None, cluster.address),
     ):
         pass

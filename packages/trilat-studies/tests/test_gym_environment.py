@@ -196,9 +196,9 @@ def test_reach_draws_places_evenly_and_detects_staying() -> None:
     for _ in range(2000):
         task.begin(random, scene)
         goals.append(task.goal - start)
-    apart = np.linalg.norm(goals, axis=1)
-    assert apart.max() <= 0.3
-    assert np.mean(apart < 0.15) == pytest.approx(0.25, abs=0.03)
+    distances = np.linalg.norm(goals, axis=1)
+    assert distances.max() <= 0.3
+    assert np.mean(distances < 0.15) == pytest.approx(0.25, abs=0.03)
     there = [
         scene._replace(t_s=t_s, end_effector_m={"s": task.goal}) for t_s in (0.1, 0.2, 0.3)
     ]

@@ -38,8 +38,8 @@ def moved_from(site: str, amplitude_nm: float, duration_s: float = 28.0) -> dict
 def draw_gain(random: np.random.Generator, low: float, high: float) -> Array:
     turn = random.uniform(0.0, np.pi)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    found: Array = axes @ np.diag(random.uniform(low, high, 2)) @ axes.T
-    return found
+    gain: Array = axes @ np.diag(random.uniform(low, high, 2)) @ axes.T
+    return gain
 
 
 def identify_drawn_hand(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
@@ -66,8 +66,8 @@ def identify_drawn_hand(seed: int, duration_s: float) -> tuple[HandMatrices, Han
 
 def covered(true: HandMatrices, hand_impedance: HandImpedance) -> Array:
     rows = [
-        np.abs(getattr(hand_impedance, k) - one) <= hand_impedance.halves[k]
-        for k, one in true._asdict().items()
+        np.abs(getattr(hand_impedance, k) - gain) <= hand_impedance.halves[k]
+        for k, gain in true._asdict().items()
     ]
     return np.array(rows)
 
@@ -92,7 +92,7 @@ def test_only_segments_with_active_sines_count(spring: HandImpedance) -> None:
     changes = moved_from("m1", 2.0, 40.0)
     changes["sites.m1.hands"] = [
         SPRING,
-        *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"]),
+        *({**hand, "end_s": 28.0} for hand in changes["sites.m1.hands"]),
     ]
     identified_hand = identify_hand(tn.simulate("free", changes))
     assert identified_hand.segments == spring.segments
@@ -116,10 +116,10 @@ def test_json_of_a_hand_is_read_again(spring: HandImpedance, tmp_path: Path) -> 
 
 
 def test_mass_behind_own_motion_is_identified_over_networks() -> None:
-    true, found = identify_drawn_hand(3, 40.0)
-    assert covered(true, found).mean() >= 0.75
-    assert np.allclose(found.M, true.M, atol=0.2)
-    assert {len(half) for half in dataclasses.asdict(found)["halves"].values()} == {2}
+    true, identified = identify_drawn_hand(3, 40.0)
+    assert covered(true, identified).mean() >= 0.75
+    assert np.allclose(identified.M, true.M, atol=0.2)
+    assert {len(half) for half in dataclasses.asdict(identified)["halves"].values()} == {2}
 
 
 @pytest.mark.long

@@ -57,8 +57,12 @@ def file(tmp_path: Path) -> Path:
 
 def test_intervals_hold_the_truth_in_95_of_100() -> None:
     draws = np.random.default_rng(1).normal(3.0, 1.0, (2000, 5))
-    found = [mean_interval(row.tolist()) for row in draws]
-    holds = [abs(one.mean - 3.0) <= one.half for one in found if one is not None]
+    intervals = [mean_interval(row.tolist()) for row in draws]
+    holds = [
+        abs(interval.mean - 3.0) <= interval.half
+        for interval in intervals
+        if interval is not None
+    ]
     assert len(holds) == 2000
     assert 0.93 < np.mean(holds) < 0.97
     assert mean_interval([1.0]) is mean_interval([1.0, None]) is None

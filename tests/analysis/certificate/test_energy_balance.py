@@ -190,9 +190,9 @@ def test_balance_equals_an_independent_book(name: str) -> None:
     runs both must agree.
     """
     overrides = {"duration_s": 2.5, "rate_hz": 500}
-    made = run(name, overrides)
+    run_of_program = run(name, overrides)
     theirs, ours = (
-        balance_by_hand(made, left_null_vector(made.scenario) * 3),
+        balance_by_hand(run_of_program, left_null_vector(run_of_program.scenario) * 3),
         runs.run(name, overrides).balance,
     )
     close = {"abs": 1e-12 * float(theirs.V.max())}
@@ -211,12 +211,12 @@ def test_v_converges_to_the_exact_functional() -> None:
     for t in (0.5, 1.2, 1.9):
         k = round(t * 1000)
         assert float(ours.V[k]) == pytest.approx(_exact_v(exact, t), abs=3e-4)
-        taken, given = _exact_integrals(exact, t)
+        taken, work = _exact_integrals(exact, t)
         assert sum(float(x[k]) for x in ours.dissipation.values()) == pytest.approx(
             taken, abs=3e-4
         )
-        assert float(ours.work["hands"][k]) == pytest.approx(given, abs=3e-4)
-        assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - given == pytest.approx(
+        assert float(ours.work["hands"][k]) == pytest.approx(work, abs=3e-4)
+        assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - work == pytest.approx(
             0.0, abs=1e-7
         )
 
@@ -395,10 +395,13 @@ def share(certificate: Certificate, name: str = "residual") -> float:
 
 
 def test_the_balance_closes_with_order_two() -> None:
-    found = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
-    assert all(one.verdict.finding is StabilityFinding.COVERED for one in found.values())
-    assert share(found[1000]) <= BAR
-    assert share(found[500]) / share(found[1000]) == pytest.approx(4.0, rel=0.1)
+    certificates = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
+    assert all(
+        certificate.verdict.finding is StabilityFinding.COVERED
+        for certificate in certificates.values()
+    )
+    assert share(certificates[1000]) <= BAR
+    assert share(certificates[500]) / share(certificates[1000]) == pytest.approx(4.0, rel=0.1)
 
 
 def test_it_closes_under_jitter_box_and_limit() -> None:
@@ -407,8 +410,8 @@ def test_it_closes_under_jitter_box_and_limit() -> None:
         **{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2}
     )
     limit = judge(**{"limits.tau_limit_nm": 25.0})
-    for found in (jitter, box, limit):
-        assert share(found) <= BAR
+    for balanced in (jitter, box, limit):
+        assert share(balanced) <= BAR
     assert box.verdict.finding is StabilityFinding.COVERED
     assert {premise.name for premise in limit.premises if not premise.holds} == {"torque"}
     assert limit.verdict.rise is not None
@@ -416,13 +419,15 @@ def test_it_closes_under_jitter_box_and_limit() -> None:
 
 
 def test_damping_near_a_singular_pose_fails_a_premise() -> None:
-    found = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
-    premise = next(one for one in found.premises if one.name == "singular poses")
+    certificate = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
+    premise = next(one for one in certificate.premises if one.name == "singular poses")
     assert premise.holds is False
     assert "s from 0 s on" in premise.text
-    assert found.balance is not None
-    assert abs(found.balance.work["singular poses"][-1]) > 0.02 * found.balance.V.max()
-    assert share(found, "unexplained") <= 2e-4
+    assert certificate.balance is not None
+    assert (
+        abs(certificate.balance.work["singular poses"][-1]) > 0.02 * certificate.balance.V.max()
+    )
+    assert share(certificate, "unexplained") <= 2e-4
 
 
 @pytest.mark.long
@@ -449,8 +454,8 @@ def test_the_axis_of_one_arm_dissipates() -> None:
 
 
 def test_following_an_axis_free_at_peers_fails() -> None:
-    found = judge(**{"sites.m.task.axes": ["x"]})
-    premise = next(one for one in found.premises if one.name == "axes")
+    certificate = judge(**{"sites.m.task.axes": ["x"]})
+    premise = next(one for one in certificate.premises if one.name == "axes")
     assert premise.holds is False
     assert "s follows m" in premise.text
 

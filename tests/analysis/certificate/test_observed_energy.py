@@ -74,8 +74,8 @@ def test_a_line_at_rest_is_a_spring() -> None:
     energies = observe_energies(log, own_laws=True)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
-    assert {one.name for one in energies.least} >= {"line m->s", "line s->m"}
-    assert min(one.amount_j for one in energies.least) >= -1e-12
+    assert {energy.name for energy in energies.least} >= {"line m->s", "line s->m"}
+    assert min(energy.amount_j for energy in energies.least) >= -1e-12
     assert energies.residual_j <= 1e-12 * energies.largest_j
     force = TO / (1 / HAND + DELAY_S / B + 1 / WALL)  # of each of two joints
     assert log["m"].tau_x[-1] == pytest.approx([-force, -force], rel=2e-3)
@@ -124,10 +124,14 @@ def test_the_certificate_reports_it_in_text_and_json() -> None:
     certificate = certify(clamped(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(certificate)}
     assert lines[certificate.observed.text] == "ok"
-    told = certificate.to_dict()["observed"]
-    assert told["finding"] == "passive"
-    assert {premise["name"] for premise in told["premises"]} == {"books", "torque", "sampling"}
-    assert np.isfinite([one["amount_j"] for one in told["least"]]).all()
+    observed = certificate.to_dict()["observed"]
+    assert observed["finding"] == "passive"
+    assert {premise["name"] for premise in observed["premises"]} == {
+        "books",
+        "torque",
+        "sampling",
+    }
+    assert np.isfinite([energy["amount_j"] for energy in observed["least"]]).all()
 
 
 @cache
@@ -144,7 +148,7 @@ def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> Non
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
     assert energies.residual_j <= 1e-12 * energies.largest_j
-    assert {one.name for one in energies.least} >= {
+    assert {energy.name for energy in energies.least} >= {
         "line m->s",
         "line s->m",
         "store of s",
@@ -159,9 +163,9 @@ def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> Non
 @pytest.mark.long
 def test_a_figure_shows_energies_over_time() -> None:
     drawn = figure(run("wave"), "observed_energy")
-    lines, known, stored, given = drawn.axes
+    lines, known, stored, given_curve = drawn.axes
     assert len(lines.lines) == len(known.lines) == len(stored.lines) == 2
-    assert len(given.lines) == 4
+    assert len(given_curve.lines) == 4
 
 
 @pytest.mark.long
@@ -181,7 +185,9 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
     )
     assert certificate.observed.finding is ObservedFinding.NEGATIVE
     assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(certificate)
-    known = next(one for one in certificate.observed.least if one.name == "known at s of m")
+    known = next(
+        energy for energy in certificate.observed.least if energy.name == "known at s of m"
+    )
     assert known.amount_j < -1e-7
     assert certificate.observed.text in certificate.reasons
 
@@ -192,7 +198,7 @@ def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
     energies = observe_energies(log)
-    taken = next(one for one in energies.least if one.name == "taken by s")
+    taken = next(energy for energy in energies.least if energy.name == "taken by s")
     assert energies.finding is ObservedFinding.NEGATIVE
     assert taken.amount_j < -1e-3
 

@@ -33,15 +33,15 @@ LATE = {"links.m1->s.outages_s": [[0.0, 0.5]], "links.m1->s.delay_ms": 100.0}
 
 
 def premises(name: str = "free", **overrides: object) -> dict[str, Premise]:
-    made = {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}}
-    return {p.name: p for p in runs.run(name, made).certificate.premises}
+    changes = {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}}
+    return {p.name: p for p in runs.run(name, changes).certificate.premises}
 
 
 def test_free_motion_satisfies_all_premises() -> None:
-    found = premises()
-    assert [p.name for p in found.values() if p.holds is not True] == []
-    assert found["delays"].text == "constant on every link: 100 ms"
-    assert found["hands"].text == "nobody pushes"
+    checked = premises()
+    assert [p.name for p in checked.values() if p.holds is not True] == []
+    assert checked["delays"].text == "constant on every link: 100 ms"
+    assert checked["hands"].text == "nobody pushes"
 
 
 @pytest.mark.parametrize(
@@ -91,10 +91,10 @@ def test_free_motion_satisfies_all_premises() -> None:
 def test_a_failed_premise_gives_its_reason(
     name: str, overrides: dict[str, object], says: str
 ) -> None:
-    found = premises(**overrides)[name]
-    assert found.holds is False
-    assert says in found.text
-    assert [text for text in strings_in(found.quantities) if " " in text] == []
+    failed = premises(**overrides)[name]
+    assert failed.holds is False
+    assert says in failed.text
+    assert [text for text in strings_in(failed.quantities) if " " in text] == []
 
 
 def strings_in(value: object) -> Iterator[str]:
@@ -113,9 +113,9 @@ def test_each_kind_of_quantities_has_its_sentence() -> None:
 
 
 def test_unequal_scalars_of_kd_pass() -> None:
-    found = premises(sites__m2__control__Kd=6.0)["Kd"]
-    assert found.holds
-    assert found.text == "one Kd up to a scalar: m1 1, m2 2, s 1"
+    checked = premises(sites__m2__control__Kd=6.0)["Kd"]
+    assert checked.holds
+    assert checked.text == "one Kd up to a scalar: m1 1, m2 2, s 1"
 
 
 def test_a_hand_that_holds_on_fails_a_premise() -> None:
@@ -143,11 +143,11 @@ def test_rounding_counts_as_no_energy(apart_rad: float, says: str) -> None:
     known = {"control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "control__Gamma": 0.0}
     starts = {f"sites__{name}__q0_rad": [0.3, 0.4] for name in ("m2", "s")}
     damper = {"sites__m1__environment": [{"kind": "viscous", "damping_nm_s_rad": [3.0, 3.0]}]}
-    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)[
+    checked = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)[
         "hands"
     ]
-    assert found.text.startswith(says)
-    assert found.holds is (apart_rad < 1e-3)
+    assert checked.text.startswith(says)
+    assert checked.holds is (apart_rad < 1e-3)
 
 
 SITE = "sites.s.environment"
@@ -161,19 +161,26 @@ def run(**changes: object) -> Log:
 
 
 def premise(log: Log) -> Premise | None:
-    return next((one for one in check_premises(gather_facts(log)) if one.name == "walls"), None)
+    return next(
+        (
+            premise_checked
+            for premise_checked in check_premises(gather_facts(log))
+            if premise_checked.name == "walls"
+        ),
+        None,
+    )
 
 
 def damper(b: float, **more: object) -> list[dict[str, object]]:
     """Returns the wall of `windup` with a damper of the arm."""
     wall = load_scenario("windup").sites["s"].environment[0]
-    place = {
+    damper_keys = {
         "point_m": list(wall.point_m),
         "normal": list(wall.normal),
         "stiffness_n_m": wall.stiffness_n_m,
     }
     return [
-        {"kind": "wall", "sampled": True, **place},
+        {"kind": "wall", "sampled": True, **damper_keys},
         {"kind": "viscous", "damping_nm_s_rad": b, **more},
     ]
 
@@ -200,29 +207,29 @@ def test_sampled_walls_give_half_k_dx_squared() -> None:
 
 
 def test_the_sampled_wall_fails_its_premise_by_name() -> None:
-    found = premise(run())
-    assert found is not None
-    assert (found.name, found.holds) == ("walls", False)
+    wall = premise(run())
+    assert wall is not None
+    assert (wall.name, wall.holds) == ("walls", False)
 
 
 @pytest.mark.parametrize(("b", "holds"), [(1.0, False), (40.0, True)])
 def test_a_damper_of_the_arm_dissipates_wall_energy(b: float, *, holds: bool) -> None:
-    found = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
-    assert found is not None
-    assert found.holds is holds
+    wall = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
+    assert wall is not None
+    assert wall.holds is holds
 
 
 def test_sampled_or_missing_dampers_dissipate_nothing() -> None:
     for more in ({"sampled": True}, {"end_s": 1.0}):
-        found = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
-        assert found is not None
-        assert found.holds is False
+        wall = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
+        assert wall is not None
+        assert wall.holds is False
 
 
 def test_unreachable_or_continuous_walls_give_no_energy() -> None:
-    away = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
-    assert away is not None
-    assert away.holds
+    far_wall = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
+    assert far_wall is not None
+    assert far_wall.holds
     assert premise(run(**{f"{SITE}.0.sampled": False})) is None
 
 

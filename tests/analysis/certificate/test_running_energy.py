@@ -71,14 +71,14 @@ def test_v_without_some_records_is_the_incomplete_logs() -> None:
 def test_v_begins_late_in_a_session_joined_late() -> None:
     log, whole = runs.run("rich").log, runs.run("rich").balance
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
-    running, found = RunningEnergy(log.scenario, windows), []
+    running, blocks = RunningEnergy(log.scenario, windows), []
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
             for record in log[site].states[first : first + BLOCK]:
                 windows[site].receive(record)
-        found.append(running.compute_next({site: windows[site].newest for site in log.sites}))
-    assert found[0] is None
-    course = joined([one for one in found if one is not None])
+        blocks.append(running.compute_next({site: windows[site].newest for site in log.sites}))
+    assert blocks[0] is None
+    course = joined([block for block in blocks if block is not None])
     assert 2.4 < course.t_s[0] < 3.2
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * np.abs(whole.V).max()

@@ -122,8 +122,8 @@ def test_gaps_are_left_out_and_reported() -> None:
         "covered by the theorem, as far as the log tells: V did not rise: "
     )
     assert "not judged: 0.995 to 1.35 s" in certificate.verdict.text
-    given = sum(np.abs(x).max() for x in certificate.balance.work.values())
-    assert given <= 1e-6  # nobody is said to have given what changed in the gap
+    work = sum(np.abs(x).max() for x in certificate.balance.work.values())
+    assert work <= 1e-6  # nobody is said to have given what changed in the gap
     assert runs.relative(certificate.balance) <= 1e-3
     # s looks back by 150 ms
     assert find_unjudged_spans(certificate.balance) == [pytest.approx((0.995, 1.35))]

@@ -49,57 +49,57 @@ def test_free_motion_is_covered() -> None:
 
 
 def test_hands_are_named_and_excused() -> None:
-    found = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
-    assert found.verdict.finding is StabilityFinding.COVERED
+    certificate = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
+    assert certificate.verdict.finding is StabilityFinding.COVERED
     assert (
         "covered by the theorem: V rose by no more than the hands gave: 24 J"
-        in found.verdict.text
+        in certificate.verdict.text
     )
 
 
 def test_outside_the_theorem_without_a_rise() -> None:
-    found = runs.run("wall").certificate
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.verdict.text.startswith(
+    certificate = runs.run("wall").certificate
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert certificate.verdict.text.startswith(
         "the theorem does not apply (premises that fail: hands); V rose by no more than the"
     )
-    assert found.bounded_by_v
+    assert certificate.bounded_by_v
 
 
 def test_a_rise_names_time_amount_and_cause() -> None:
-    found = runs.run("free", runs.JITTER).certificate
-    rise = found.verdict.rise
-    assert found.verdict.finding is StabilityFinding.ROSE
+    certificate = runs.run("free", runs.JITTER).certificate
+    rise = certificate.verdict.rise
+    assert certificate.verdict.finding is StabilityFinding.ROSE
     assert rise is not None
-    assert rise.amount > 10 * found.verdict.tolerance
+    assert rise.amount > 10 * certificate.verdict.tolerance
     assert sum(rise.causes.values()) >= rise.amount
     assert all("->" in cause for cause in rise.causes)
-    share = 100.0 * rise.amount / found.balance.V.max()
+    share = 100.0 * rise.amount / certificate.balance.V.max()
     assert (
         f"V rose by {rise.amount:.3g} J ({share:.3g} % of its largest value) "
-        in found.verdict.text
+        in certificate.verdict.text
     )
-    assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
+    assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in certificate.verdict.text
 
 
 def test_kd_of_different_shape_makes_v_rise() -> None:
-    found = certify(
+    certificate = certify(
         simulate_free(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
     )
-    assert found.verdict.finding is StabilityFinding.ROSE
-    assert found.verdict.rise is not None
-    assert list(found.verdict.rise.causes) == ["what beta does not cancel"]
+    assert certificate.verdict.finding is StabilityFinding.ROSE
+    assert certificate.verdict.rise is not None
+    assert list(certificate.verdict.rise.causes) == ["what beta does not cancel"]
 
 
 def test_sampling_feeds_a_slow_digital_loop() -> None:
     """T = 0 at 80 Hz: `digital` keeps swinging, because torques are held over a tick."""
-    found = certify(
+    certificate = certify(
         simulate_free(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0)
     )
-    assert found.verdict.finding is StabilityFinding.ROSE
-    assert found.verdict.rise is not None
-    assert next(iter(found.verdict.rise.causes)) == "sampling"
-    assert found.end.behaviour is not EndBehaviour.CONVERGED
+    assert certificate.verdict.finding is StabilityFinding.ROSE
+    assert certificate.verdict.rise is not None
+    assert next(iter(certificate.verdict.rise.causes)) == "sampling"
+    assert certificate.end.behaviour is not EndBehaviour.CONVERGED
 
 
 def tampered(change: Callable[[State], State]) -> Certificate:
@@ -113,30 +113,30 @@ def test_a_changed_record_breaks_its_sites_balance(field: str) -> None:
         values = [1.05 * x for x in getattr(state, field)]
         return msgspec.structs.replace(state, **{field: values}) if late else state
 
-    found = tampered(change)
-    assert found.verdict.finding is StabilityFinding.BROKEN
-    assert not found.passed
-    assert "were not made by the equations that the log claims" in found.verdict.text
+    certificate = tampered(change)
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
+    assert not certificate.passed
+    assert "were not made by the equations that the log claims" in certificate.verdict.text
 
 
 def test_changed_records_break_balances_under_varying_delay() -> None:
     log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
-    found = certify(
+    certificate = certify(
         logs.rewritten(
             log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s
         )
     )
-    assert found.verdict.finding is StabilityFinding.BROKEN
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
 
 
 def test_erased_hands_break_the_balance() -> None:
     log = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
-    found = certify(
+    certificate = certify(
         logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
     )
-    assert found.verdict.finding is StabilityFinding.BROKEN
-    assert "the energy of m1 does not add up" in found.verdict.text
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
+    assert "the energy of m1 does not add up" in certificate.verdict.text
 
 
 FOUR = """
@@ -175,16 +175,16 @@ def test_groups_made_by_a_change_are_refused() -> None:
     joined = FOUR.replace("c = { d = 1.0 }", "c = { d = 0.5, a = 0.5 }")
     step = '[[timeline]]\nat_s = 1.0\ndominance = "c"\nto = { d = 1.0 }\nramp_s = 0.5\n'
     assert certify(trilat_net.simulate(parse_scenario(joined))).balance is not None
-    found = certify(trilat_net.simulate(parse_scenario(joined + step)))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    certificate = certify(trilat_net.simulate(parse_scenario(joined + step)))
+    assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
 
 
 def test_a_site_without_weight_converges_after_peers() -> None:
     """V does not contain m2; if only the shares fail, the motion of its peers bounds m2."""
-    found = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.end.stability is Stability.OPEN
-    assert found.bounded_by_v
+    certificate = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert certificate.end.stability is Stability.OPEN
+    assert certificate.bounded_by_v
 
 
 def test_weightless_sites_with_other_failures_need_growth() -> None:
@@ -193,10 +193,12 @@ def test_weightless_sites_with_other_failures_need_growth() -> None:
             {"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}
         ]
     }
-    found = runs.run("free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}).certificate
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert not found.bounded_by_v
-    assert not found.passed
+    certificate = runs.run(
+        "free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}
+    ).certificate
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert not certificate.bounded_by_v
+    assert not certificate.passed
 
 
 def still() -> Certificate:
@@ -229,17 +231,17 @@ def test_growth_fails_a_run_despite_v() -> None:
 def test_only_accepted_outcomes_pass_besides_stable(
     behaviour: EndBehaviour, accepted: tuple[str, ...], passes: bool
 ) -> None:
-    found = replace(still(), end=still().end._replace(behaviour=behaviour))
-    assert not found.passed
-    assert found.accepts(accepted) is passes
+    certificate = replace(still(), end=still().end._replace(behaviour=behaviour))
+    assert not certificate.passed
+    assert certificate.accepts(accepted) is passes
 
 
 def test_a_broken_balance_is_never_accepted() -> None:
-    found = tampered(
+    certificate = tampered(
         lambda s: msgspec.structs.replace(s, q=[1.05 * x for x in s.q]) if s.tick > 375 else s
     )
-    assert found.verdict.finding is StabilityFinding.BROKEN
-    assert not found.accepts(("bounded", "open"))
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
+    assert not certificate.accepts(("bounded", "open"))
 
 
 def test_an_unstable_rest_never_passes_a_run() -> None:
@@ -296,11 +298,11 @@ def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
     """At the end, the beginning or in between, of one site."""
     taken = taken_apart(recorded("free", RUN)).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
-    own = "/trilat/free/s/state"
+    topic = "/trilat/free/s/state"
     taken.messages = [
-        m for m in taken.messages if topics[m.channel] != own or m.sequence not in cut
+        m for m in taken.messages if topics[m.channel] != topic or m.sequence not in cut
     ]
-    accounts[own] = accounts[own].replace(
+    accounts[topic] = accounts[topic].replace(
         "received 3000, missing 0", "received 2965, missing 35"
     )
     certificate = certify_bytes(taken.bytes())

@@ -124,9 +124,11 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
     s = 2j * math.pi
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
     M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
-    own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
+    own_impedance = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
     far = -20.0 * np.exp(-0.1 * s) * np.eye(2)
-    q = np.linalg.solve(np.block([[own, far], [far, own]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    q = np.linalg.solve(
+        np.block([[own_impedance, far], [far, own_impedance]]), np.array([1.0, 0.0, 0.0, 0.0])
+    )
     Z = 1.0 / (s * q[0])
     assert found.ratio.gain == pytest.approx(abs(Z), rel=0.02)
     assert found.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
@@ -135,9 +137,9 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
 def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
     responses = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
-    for one in responses:
-        if one.kind == "impedance":
-            assert one.ratio.gain is None
+    for response in responses:
+        if response.kind == "impedance":
+            assert response.ratio.gain is None
 
 
 def closed_form_impedance(frequency_hz: float, c2: float) -> complex:
@@ -146,9 +148,11 @@ def closed_form_impedance(frequency_hz: float, c2: float) -> complex:
     """
     s = 2j * math.pi * frequency_hz
     M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
-    own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
+    own_impedance = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
     far = -20.0 * np.exp(-0.1 * s) * np.eye(2)
-    q = np.linalg.solve(np.block([[own, far], [far, own]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    q = np.linalg.solve(
+        np.block([[own_impedance, far], [far, own_impedance]]), np.array([1.0, 0.0, 0.0, 0.0])
+    )
     return complex(1.0 / (s * q[0]))
 
 

@@ -31,13 +31,13 @@ GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 def told(log: Log) -> dict[str, Any]:
     """Returns the facts of a log after checking the rules that all facts obey."""
     measured = compute_log_metrics(log)
-    found: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
-    assert set(found["sites"]) == set(log.sites)
-    assert len(found["links"]) == len(log.sites) * (len(log.sites) - 1)
-    unknown = found["unknown"]
+    facts: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
+    assert set(facts["sites"]) == set(log.sites)
+    assert len(facts["links"]) == len(log.sites) * (len(log.sites) - 1)
+    unknown = facts["unknown"]
     for quantity in quantities():
         kind = "run" if quantity.of == "run" else f"{quantity.of}s"
-        places = {"run": found["run"]} if kind == "run" else found[kind]
+        places = {"run": facts["run"]} if kind == "run" else facts[kind]
         for name, values in places.items():
             path = f"run.{quantity.key}" if kind == "run" else f"{kind}.{name}.{quantity.key}"
             value = values[quantity.key]
@@ -46,21 +46,21 @@ def told(log: Log) -> dict[str, Any]:
             assert path not in unknown or unknown[path]
         whole = measured.run_value(quantity)
         assert (whole.value is None) == bool(whole.why)
-    return found
+    return facts
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_every_released_version_is_measured(path: Path) -> None:
-    found = told(trilat_net.open_log(path))
-    assert found["sites"]["s"]["rms_error_rad"] > 0.0
-    assert found["sites"]["s"]["unaccounted_j"] < 1e-3
-    assert found["links"]["m2->s"]["age_mean_ms"] > 0.0
+    facts = told(trilat_net.open_log(path))
+    assert facts["sites"]["s"]["rms_error_rad"] > 0.0
+    assert facts["sites"]["s"]["unaccounted_j"] < 1e-3
+    assert facts["links"]["m2->s"]["age_mean_ms"] > 0.0
 
 
 def test_busy_and_uneven_sites_are_measured() -> None:
-    found = told(logs.busy().log)
-    assert found["links"]["b->a"]["burst"] > 1.0
-    assert found["links"]["b->a"]["loss"] == pytest.approx(0.2, abs=0.1)
+    facts = told(logs.busy().log)
+    assert facts["links"]["b->a"]["burst"] > 1.0
+    assert facts["links"]["b->a"]["loss"] == pytest.approx(0.2, abs=0.1)
     told(logs.simulated("four"))
 
 
@@ -69,10 +69,10 @@ def test_gaps_and_late_starts_are_counted() -> None:
     torn = logs.rewritten(
         log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False
     )
-    found = told(torn)
-    assert found["sites"]["m1"]["missing"] == 40.0
-    assert found["sites"]["m1"]["unaccounted_j"] < 1e-3
-    assert not found["complete"]
+    facts = told(torn)
+    assert facts["sites"]["m1"]["missing"] == 40.0
+    assert facts["sites"]["m1"]["unaccounted_j"] < 1e-3
+    assert not facts["complete"]
     late = told(logs.rewritten(log, lambda state: 150 < state.tick < 400))
     assert late["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert late["run"]["spread_max_rad"] > 0.0
@@ -80,27 +80,27 @@ def test_gaps_and_late_starts_are_counted() -> None:
 
 def test_a_missing_site_lacks_only_its_figures() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    found = told(logs.rewritten(log, lambda state: state.site != "m1"))
-    assert found["sites"]["m2"]["controller_j"] is not None
-    assert found["links"]["m2->s"]["delay_j"] is not None
-    assert found["unknown"]["sites.m1.controller_j"] == "no records of m1"
-    assert found["unknown"]["links.m1->s.following_rms_rad"] == "no records of m1"
-    assert found["unknown"]["run.spread_rms_rad"] == "no records of m1"
-    assert found["unknown"]["windows_at_rest"] == "no records of m1"
-    assert "m1" not in found["parameters"]
+    facts = told(logs.rewritten(log, lambda state: state.site != "m1"))
+    assert facts["sites"]["m2"]["controller_j"] is not None
+    assert facts["links"]["m2->s"]["delay_j"] is not None
+    assert facts["unknown"]["sites.m1.controller_j"] == "no records of m1"
+    assert facts["unknown"]["links.m1->s.following_rms_rad"] == "no records of m1"
+    assert facts["unknown"]["run.spread_rms_rad"] == "no records of m1"
+    assert facts["unknown"]["windows_at_rest"] == "no records of m1"
+    assert "m1" not in facts["parameters"]
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 3])
 def test_nearly_empty_logs_are_no_error(ticks: int) -> None:
     log = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
-    found = told(logs.rewritten(log, lambda state: state.tick < ticks))
-    assert (found["sites"]["m"]["controller_j"] is None) == (ticks < 2)
-    assert (found["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
+    facts = told(logs.rewritten(log, lambda state: state.tick < ticks))
+    assert (facts["sites"]["m"]["controller_j"] is None) == (ticks < 2)
+    assert (facts["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
 
 
 def test_a_diverged_run_is_measured_until_divergence() -> None:
-    found = told(logs.diverged())
-    assert found["sites"]["m1"]["unaccounted_j"] < 1e-2
+    facts = told(logs.diverged())
+    assert facts["sites"]["m1"]["unaccounted_j"] < 1e-2
 
 
 @pytest.mark.parametrize("size", [1e200, 1e308])
@@ -122,10 +122,10 @@ def test_unphysical_numbers_are_missing_without_error(size: float) -> None:
 def test_loops_are_reported_if_clocks_were_read() -> None:
     """Every loop late by its tick in us, every tick 7 us of work."""
     log = logs.timed(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))
-    found = told(log)["sites"]["m1"]
-    assert found["late_max_us"] == 199.0
-    assert found["busy_p99_us"] == 7.0
-    assert found["overruns"] == 0.0
+    facts = told(log)["sites"]["m1"]
+    assert facts["late_max_us"] == 199.0
+    assert facts["busy_p99_us"] == 7.0
+    assert facts["overruns"] == 0.0
     assert (
         told(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))["sites"]["m1"][
             "late_max_us"
@@ -149,11 +149,11 @@ def test_a_row_is_the_largest_or_the_sum() -> None:
             "q_des": [0.0, 0.0],
         }
     )
-    found = compare_metrics([log, log], ["a", "b"])
-    assert found.columns == ("a", "b")
-    assert found.row("peak_tau_nm").values == (4.0, 4.0)
-    assert found.row("effort_nm2_s").values == pytest.approx((25.0 * 4.0, 25.0 * 4.0))
-    assert found.row("max_error_rad").values == (0.1, 0.1)
+    comparison = compare_metrics([log, log], ["a", "b"])
+    assert comparison.columns == ("a", "b")
+    assert comparison.row("peak_tau_nm").values == (4.0, 4.0)
+    assert comparison.row("effort_nm2_s").values == pytest.approx((25.0 * 4.0, 25.0 * 4.0))
+    assert comparison.row("max_error_rad").values == (0.1, 0.1)
 
 
 def test_runs_lack_figures_missing_at_a_site() -> None:
@@ -180,9 +180,9 @@ def test_rows_without_any_value_are_left_out() -> None:
 
 def test_json_has_value_and_reason_per_column() -> None:
     free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    found = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
-    assert found["columns"] == ["log"]
-    for row in found["rows"]:
+    facts = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
+    assert facts["columns"] == ["log"]
+    for row in facts["rows"]:
         assert (row["values"][0] is None) == (row["unknown"][0] is not None)
 
 
@@ -190,11 +190,11 @@ def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
     """int (a^2 + b^2 sin^2) dt over whole periods is (a^2 + b^2 / 2) times the time."""
     a, b = 3.0, 8.0
     log = pair(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
-    found = compute_log_metrics(log).sites["m"]
-    assert found["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
-    assert found["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
-    assert found["peak_tau_nm"].value == pytest.approx(b, rel=1e-9)
-    assert found["saturated_share"].value == 0.0
+    figures = compute_log_metrics(log).sites["m"]
+    assert figures["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
+    assert figures["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
+    assert figures["peak_tau_nm"].value == pytest.approx(b, rel=1e-9)
+    assert figures["saturated_share"].value == 0.0
 
 
 def test_saturation_is_the_share_of_limited_ticks() -> None:
@@ -226,14 +226,14 @@ ANCHORED = {
 
 def test_learnt_gravity_is_a_spring_to_pose() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
-    found = compute_log_metrics(simulated("paper", ANCHORED))
-    assert [one.site for one in found.stiffness] == ["m1", "m1"]
-    second = found.stiffness[1]
+    metrics = compute_log_metrics(simulated("paper", ANCHORED))
+    assert [stiffness.site for stiffness in metrics.stiffness] == ["m1", "m1"]
+    second = metrics.stiffness[1]
     assert second.joint == 2
     assert second.torque_nm == pytest.approx(5.0)
     assert second.stiffness_nm_rad == pytest.approx(3.0 * 9.81**2 * 1.2, rel=0.01)
     # equal torques act on q1 + q2 alone: what joint 1 does is too little to tell, or very stiff
-    first = found.stiffness[0].stiffness_nm_rad
+    first = metrics.stiffness[0].stiffness_nm_rad
     assert first is None or abs(first) > 10.0 * second.stiffness_nm_rad
 
 
@@ -241,9 +241,9 @@ def test_no_stiffness_is_given_under_changing_shares() -> None:
     """In `training` the shares change and the hands do not: no stiffness is stated, in
     particular not their 200 N m/rad.
     """
-    found = compute_log_metrics(simulated("training", {"rate_hz": 50}))
-    assert found.static_windows.value == 2.0
-    assert found.stiffness == []
+    metrics = compute_log_metrics(simulated("training", {"rate_hz": 50}))
+    assert metrics.static_windows.value == 2.0
+    assert metrics.stiffness == []
 
 
 SLOW = {"rate_hz": 50}
@@ -251,48 +251,52 @@ SLOW = {"rate_hz": 50}
 
 def test_the_felt_stiffness_follows_the_shares() -> None:
     """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
-    found = compute_log_metrics(simulated("force_sharing", SLOW))
-    assert [pair.pushed + pair.holds for pair in found.sharing_ratios] == ["sm1", "sm2", "sm2"]
-    assert [pair.felt_nm for pair in found.sharing_ratios] == pytest.approx(
+    metrics = compute_log_metrics(simulated("force_sharing", SLOW))
+    assert [pair.pushed + pair.holds for pair in metrics.sharing_ratios] == [
+        "sm1",
+        "sm2",
+        "sm2",
+    ]
+    assert [pair.felt_nm for pair in metrics.sharing_ratios] == pytest.approx(
         [4.79, 16.4, 5.0], rel=0.02
     )
-    assert [pair.pushed_nm for pair in found.sharing_ratios] == [pytest.approx(5.0)] * 3
-    assert [pair.joint for pair in found.sharing_ratios] == [1, 1, 1]
+    assert [pair.pushed_nm for pair in metrics.sharing_ratios] == [pytest.approx(5.0)] * 3
+    assert [pair.joint for pair in metrics.sharing_ratios] == [1, 1, 1]
     # beta = (0.444, 0.130, 0.426), Eq. (20): 1 - a23 a32, 1 - a13 a31, 1 - a12 a21
     beta = (1.0 - 0.2 * 0.2, 1.0 - 0.9 * 0.8, 1.0 - 0.1 * 0.8)
-    expected = [pair.expected_nm.value for pair in found.sharing_ratios]
+    expected = [pair.expected_nm.value for pair in metrics.sharing_ratios]
     assert expected == pytest.approx(
         [5.0 * beta[2] / beta[0], 5.0 * beta[2] / beta[1], 5.0], rel=1e-6
     )
-    assert found.run["sharing_off"].value <= 0.01
+    assert metrics.run["sharing_off"].value <= 0.01
 
 
 def test_three_loaded_sites_balance() -> None:
     """Stiffer sites count less: K_i enters, not the shares alone."""
     settings = {"sites.m1.control.Kp": 60.0, "duration_s": 15.0, **SLOW}
-    found = compute_log_metrics(simulated("force_sharing", settings))
-    assert found.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
-    assert found.sharing_ratios[0].off <= 0.01
-    assert found.joint_loads[0].imbalance.value <= 0.01
+    metrics = compute_log_metrics(simulated("force_sharing", settings))
+    assert metrics.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
+    assert metrics.sharing_ratios[0].off <= 0.01
+    assert metrics.joint_loads[0].imbalance.value <= 0.01
 
 
 def test_with_learnt_gravity_no_sharing_is_expected() -> None:
-    found = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
-    assert found.sharing_ratios
-    for one in found.sharing_ratios:
-        assert one.pushed == "s"
-        assert one.by_wall
-        assert one.holds == "m1"
-        assert one.expected_nm.value is None
-        assert "gravity is learnt" in one.expected_nm.why
-        assert one.off is None
+    metrics = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
+    assert metrics.sharing_ratios
+    for ratio in metrics.sharing_ratios:
+        assert ratio.pushed == "s"
+        assert ratio.by_wall
+        assert ratio.holds == "m1"
+        assert ratio.expected_nm.value is None
+        assert "gravity is learnt" in ratio.expected_nm.why
+        assert ratio.off is None
 
 
 def test_moving_arms_have_no_force_sharing() -> None:
-    found = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
-    assert found.static_windows.value is None
+    metrics = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
+    assert metrics.static_windows.value is None
     assert (
-        found.run["sharing_off"].why
+        metrics.run["sharing_off"].why
         == "no second in which all sites rest under constant torques"
     )
 
@@ -326,10 +330,10 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
 
 
 def test_a_law_without_estimates_is_reported() -> None:
-    found = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
-    assert found.value is None
-    assert found.why == "nothing is learnt"
-    assert not found.applies
+    figure = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
+    assert figure.value is None
+    assert figure.why == "nothing is learnt"
+    assert not figure.applies
 
 
 def test_without_truth_estimates_have_no_error() -> None:

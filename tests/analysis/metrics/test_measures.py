@@ -45,12 +45,12 @@ print(json.dumps({
 
 def test_an_added_file_is_a_metric_everywhere(tmp_path: Path) -> None:
     (tmp_path / "haste.py").write_text(METRIC)
-    found = look(LOOK, tmp_path)
-    assert 0.0 < found["json"] < found["compared"][0] == found["compared"][1]
-    assert "mean |qd|" in found["text"]
-    assert "haste_rad_s" in found["frame"]
-    assert 0.0 < found["swept"] != found["compared"][0]
-    assert ["metrics.haste_rad_s", True] in found["expected"]
+    output = look(LOOK, tmp_path)
+    assert 0.0 < output["json"] < output["compared"][0] == output["compared"][1]
+    assert "mean |qd|" in output["text"]
+    assert "haste_rad_s" in output["frame"]
+    assert 0.0 < output["swept"] != output["compared"][0]
+    assert ["metrics.haste_rad_s", True] in output["expected"]
 
 
 def test_duplicate_keys_are_refused_with_both_files() -> None:

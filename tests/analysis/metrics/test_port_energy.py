@@ -57,13 +57,13 @@ def _mechanical(log, site: str):
 
 
 def test_lossless_walls_return_at_most_their_energy() -> None:
-    found = compute_log_metrics(
+    metrics = compute_log_metrics(
         simulated("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250})
     ).sites["s"]
-    assert found["walls_j"].value <= 0.0
-    assert found["walls_most_j"].value <= 1e-6
+    assert metrics["walls_j"].value <= 0.0
+    assert metrics["walls_most_j"].value <= 1e-6
     # what is missing is in the spring: F^2 / 2 K at its last force of 3.3 N
-    assert found["walls_j"].value == pytest.approx(-(3.3**2) / 4000.0, rel=0.1)
+    assert metrics["walls_j"].value == pytest.approx(-(3.3**2) / 4000.0, rel=0.1)
 
 
 def test_a_damper_dissipates_by_the_formula() -> None:
@@ -78,10 +78,10 @@ def test_a_damper_dissipates_by_the_formula() -> None:
     more = 'environment = [{ kind = "viscous", damping_nm_s_rad = 4.0 }]'
     log = pair(motion, more=more)
     spent = B * A**2 * w**2 / 2.0 * log["s"].t_s[-1]
-    found = compute_log_metrics(log).sites["s"]
-    assert found["walls_j"].value == pytest.approx(-spent, rel=2e-3)
-    assert found["walls_most_j"].value == 0.0
-    assert found["hands_j"].value == pytest.approx(0.0, abs=1e-9)
+    figures = compute_log_metrics(log).sites["s"]
+    assert figures["walls_j"].value == pytest.approx(-spent, rel=2e-3)
+    assert figures["walls_most_j"].value == 0.0
+    assert figures["hands_j"].value == pytest.approx(0.0, abs=1e-9)
 
 
 def test_periods_without_both_records_are_left_out() -> None:
@@ -102,12 +102,14 @@ def test_an_unknown_arm_has_no_mechanical_energy() -> None:
     """The energy through the ports is known all the same; an external arm was given tau."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     outside = replace_scenario(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
-    found, before = (compute_log_metrics(one).sites["s"] for one in (outside, log))
-    assert found["mechanical_j"].value is None
-    assert found["mechanical_j"].why == "theta of the arm is not known"
+    outside_figures, before = (
+        compute_log_metrics(measured_log).sites["s"] for measured_log in (outside, log)
+    )
+    assert outside_figures["mechanical_j"].value is None
+    assert outside_figures["mechanical_j"].why == "theta of the arm is not known"
     part = log["s"]
     expected = float(np.trapezoid((part.tau * part.qd).sum(axis=1), part.t_s))
-    assert found["controller_j"].value == pytest.approx(expected, rel=1e-2)
+    assert outside_figures["controller_j"].value == pytest.approx(expected, rel=1e-2)
     assert before["mechanical_j"].value is not None
 
 
@@ -128,11 +130,11 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
         return {**wave, "tau": [0.0, 0.0], "tau_x": [0.0, 0.0]}
 
     seconds = 10.0
-    found = compute_log_metrics(pair(motion, seconds=seconds)).links["m->s"]
+    figures = compute_log_metrics(pair(motion, seconds=seconds)).links["m->s"]
     # until the first sample comes the peer is at its start pose
     begun = 0.5 * w * delay_s / math.pi
     expected = -distance * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
-    assert found["delay_j"].value == pytest.approx(expected, rel=2e-3)
+    assert figures["delay_j"].value == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("law", ["pd_d", "adaptive", "p_d"])
@@ -153,9 +155,9 @@ def test_delay_energy_is_the_ports_excess(law: str) -> None:
         late = sum(
             metrics.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer]
         )
-        given = metrics.sites[site]["controller_j"].value
+        controller_j = metrics.sites[site]["controller_j"].value
         scale = float(np.trapezoid(np.abs((torque * part.qd).sum(axis=1)), part.t_s))
-        assert prompt + late == pytest.approx(given, abs=2e-4 * scale)
+        assert prompt + late == pytest.approx(controller_j, abs=2e-4 * scale)
         largest = max(largest, abs(late) / scale)
     assert largest > 5e-3  # and that is no small part
 

@@ -53,7 +53,7 @@ def pushed(log: Log, steps: Mapping[int, float] | None = None) -> Log:
     way = np.cumsum(step).tolist()
 
     def change(state: Any) -> Any:
-        tau_x = [-one for one in PUSHES[state.site]]
+        tau_x = [-torque for torque in PUSHES[state.site]]
         return msgspec.structs.replace(state, tau_x=tau_x, q_des=[way[state.tick], 0.0])
 
     return rewritten(log, change=change)
@@ -78,10 +78,10 @@ def test_effort_of_a_hand_counts_by_its_share() -> None:
 
 def test_the_smaller_of_opposed_torques_cancels() -> None:
     """Joint 1 has 3 against -1, joint 2 has 2 and 1: 1 N m of joint 1 cancels on both sides, of 7 in all."""
-    found = compute_log_metrics(prescribed()).run
-    assert found["internal_rms_nm"].value == pytest.approx(1.0)
-    assert found["internal_share"].value == pytest.approx(2.0 / 7.0)
-    assert not found["internal_rms_n"].applies
+    figures = compute_log_metrics(prescribed()).run
+    assert figures["internal_rms_nm"].value == pytest.approx(1.0)
+    assert figures["internal_share"].value == pytest.approx(2.0 / 7.0)
+    assert not figures["internal_rms_n"].applies
 
 
 def test_three_users_cancel_except_the_remaining_torque() -> None:
@@ -90,15 +90,15 @@ def test_three_users_cancel_except_the_remaining_torque() -> None:
         "RAMP", "0.5"
     )
     text = text.replace("[[timeline]]", "m3 = { s = 1.0 }\n[[timeline]]")
-    found = compute_log_metrics(pushed(trilat_net.simulate(parse_scenario(text)))).run
-    assert found["internal_rms_nm"].value == pytest.approx(3.0)
-    assert found["internal_share"].value == pytest.approx(8.0 / 12.0)
+    figures = compute_log_metrics(pushed(trilat_net.simulate(parse_scenario(text)))).run
+    assert figures["internal_rms_nm"].value == pytest.approx(3.0)
+    assert figures["internal_share"].value == pytest.approx(8.0 / 12.0)
 
 
 def test_a_takeover_lasts_until_the_larger_share() -> None:
     """The ramp of 0.5 s passes 1/2 at 1.25 s: ticks 0 to 249 of 400 are m1's; at equal shares m2 leads."""
     run = measure_run(prescribed(), ["intervention_share", "takeovers", "takeover_s"])
-    assert {key: one.value for key, one in run.items()} == {
+    assert {key: figure.value for key, figure in run.items()} == {
         "intervention_share": pytest.approx(250.0 / 400.0),
         "takeovers": 1.0,
         "takeover_s": pytest.approx(0.25, abs=1e-9),
@@ -109,8 +109,8 @@ def test_the_log_names_the_program_as_user() -> None:
     """m1 leads for ticks 0 to 249, and at tick 250, with equal shares, if m1 is the program."""
     event = Event(member="m1", boot=1, kind="hand", text="m1: policy takes hold at t = 0.000 s")
     log = rewritten(prescribed(), others=[event])
-    found = measure_run(log, ["intervention_share"])["intervention_share"]
-    assert found.value == pytest.approx(149.0 / 400.0)
+    figure = measure_run(log, ["intervention_share"])["intervention_share"]
+    assert figure.value == pytest.approx(149.0 / 400.0)
 
 
 def test_a_step_of_shares_takes_over_at_once() -> None:
@@ -124,13 +124,13 @@ def test_a_step_of_shares_takes_over_at_once() -> None:
 )
 def test_a_jump_counts_while_shares_change(tick: int, jump: float) -> None:
     """A step of 4 mrad among those of 1 mrad: of the ramp from tick 200 to 300, or of the rest."""
-    found = compute_log_metrics(prescribed(steps={tick: 4e-3})).run["lead_jump"]
-    assert found.value == pytest.approx(jump, rel=1e-6)
+    figure = compute_log_metrics(prescribed(steps={tick: 4e-3})).run["lead_jump"]
+    assert figure.value == pytest.approx(jump, rel=1e-6)
 
 
 def test_two_sites_have_no_users_who_share() -> None:
-    found = compute_log_metrics(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
-    assert {found[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {
+    figures = compute_log_metrics(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
+    assert {figures[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {
         False
     }
 

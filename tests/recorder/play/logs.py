@@ -21,11 +21,11 @@ EPOCH_UNIX_NS = 1_700_000_000_000_000_000
 
 def payloads(path: Path) -> dict[str, list[bytes]]:
     """Returns every payload of a finished file by topic, in file order, read by the `mcap` package."""
-    found: dict[str, list[bytes]] = {}
+    payloads_by_topic: dict[str, list[bytes]] = {}
     with path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
-            found.setdefault(channel.topic, []).append(message.data)
-    return found
+            payloads_by_topic.setdefault(channel.topic, []).append(message.data)
+    return payloads_by_topic
 
 
 def session_payloads(path: Path) -> dict[str, list[bytes]]:

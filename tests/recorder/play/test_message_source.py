@@ -32,8 +32,10 @@ def joined(blocks: list[MessageBatch]) -> list[PlayedMessage]:
 def sorted_in(
     messages: list[PlayedMessage], *how: int, **limits: int
 ) -> tuple[list[PlayedMessage], int]:
-    found = list(sort_messages(messages, *how, **limits))
-    return joined([batch for batch, _ in found]), sum(strays for _, strays in found)
+    sorted_messages = list(sort_messages(messages, *how, **limits))
+    return joined([batch for batch, _ in sorted_messages]), sum(
+        strays for _, strays in sorted_messages
+    )
 
 
 @given(

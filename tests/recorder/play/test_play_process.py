@@ -125,7 +125,7 @@ def test_payloads_come_in_order_of_their_channel(log_file: Path) -> None:
     outcome = hall.play()
     assert hall.heard == session_payloads(log_file)
     assert outcome.counts == {
-        f"/trilat/paper/{key}": len(found) for key, found in hall.heard.items()
+        f"/trilat/paper/{key}": len(payload_list) for key, payload_list in hall.heard.items()
     }
     assert (outcome.rounds, outcome.cut, outcome.strays, outcome.recorders) == (1, 0, 0, 0)
     assert outcome.lateness is not None
@@ -264,8 +264,8 @@ def test_logs_play_under_their_own_name(log_file: Path) -> None:
     )
     hall.play()
     wanted = {
-        key: found
-        for key, found in session_payloads(log_file).items()
+        key: payload_list
+        for key, payload_list in session_payloads(log_file).items()
         if not key.endswith("link")
     }
     assert hall.heard == wanted

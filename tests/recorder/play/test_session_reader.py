@@ -24,8 +24,8 @@ def test_site_messages_are_read_byte_for_byte(log_file: Path) -> None:
     for _, channel, _, payload in block.messages():
         played[facts.topics[channel]].append(payload)
     published = {
-        topic: found
-        for topic, found in payloads(log_file).items()
+        topic: payload_list
+        for topic, payload_list in payloads(log_file).items()
         if topic.startswith("/trilat/")
     }
     assert played == published
@@ -50,7 +50,7 @@ def test_older_log_versions_are_read(version: int) -> None:
     assert facts.version == version
     assert set(facts.boots) == {"m1", "m2", "s"}
     read = sorted(payload for _, _, _, payload in block.messages())
-    assert read == sorted(p for found in payloads(path).values() for p in found)
+    assert read == sorted(p for payload_list in payloads(path).values() for p in payload_list)
 
 
 @given(start_ms=st.integers(-10, 250), length_ms=st.integers(11, 320))
@@ -74,9 +74,9 @@ def test_times_are_sent_or_received(tmp_path: Path) -> None:
 
 
 def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
-    one = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
+    first_part = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
     two = write(tmp_path / "2.mcap", [("m1", 1, 10, 30), ("m1", 2, 20, 30), ("m1", 3, 40, 40)])
-    facts, block = loaded(one, two)
+    facts, block = loaded(first_part, two)
     assert [payload for _, _, _, payload in block.messages()] == [
         event("m1", n) for n in range(4)
     ]
@@ -85,7 +85,7 @@ def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
     with pytest.raises(
         LogError, match=r"3\.mcap: belongs to a different session from .*1\.mcap"
     ):
-        preload_messages([one, other], PlaySelection(), LARGE)
+        preload_messages([first_part, other], PlaySelection(), LARGE)
 
 
 def test_torn_files_are_read_while_whole(short_log: bytes, tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ def remembered(
 ) -> PlayedHistory:
     memory = PlayedHistory(kept_ns)
     gathering = BatchBuilder()
-    for place, number in enumerate(numbers):
-        gathering.add(place, CHANNEL, number, number.to_bytes(2, "big") * size)
-        gathering.add(place, OTHER, number, b"other")
+    for index, number in enumerate(numbers):
+        gathering.add(index, CHANNEL, number, number.to_bytes(2, "big") * size)
+        gathering.add(index, OTHER, number, b"other")
     for piece in gathering.ordered().pieces(40):
         memory.add(piece)
     if played:
@@ -28,8 +28,8 @@ def remembered(
 
 def naive(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
     """Returns messages from the first number there is, one after the other, until a gap."""
-    made = numbers[-1] + 1 if numbers else 0
-    if first >= made:
+    next_number = numbers[-1] + 1 if numbers else 0
+    if first >= next_number:
         return first, []
     begin = next(n for n in numbers if n >= first)
     run = []

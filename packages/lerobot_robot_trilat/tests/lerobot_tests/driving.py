@@ -34,7 +34,7 @@ def drive(
             teleoperator.enable_torque()
         teleoperator.send_feedback(goal)
         wait_s(1.0 / 30.0)
-    told = {
+    observations = {
         "before": before,
         "after": teleoperator.get_teleop_events(),
         "observed": robot.get_observation(),
@@ -48,7 +48,7 @@ def drive(
     teleoperator.disconnect()
     robot.disconnect()
     assert not robot.is_connected
-    return told
+    return observations
 
 
 def assert_taken_over(seen: dict[str, Any], log: Log) -> None:

@@ -74,19 +74,19 @@ def _device(name: str) -> type:
 
 
 def _modules() -> dict[str, ModuleType]:
-    made = {
+    modules = {
         name: ModuleType(name) for name in ("lerobot", "lerobot.utils", "lerobot.utils.errors")
     }
     for room, name in (("robots", "Robot"), ("teleoperators", "Teleoperator")):
-        made[f"lerobot.{room}"] = ModuleType(f"lerobot.{room}")
-        made[f"lerobot.{room}"].__dict__.update(
+        modules[f"lerobot.{room}"] = ModuleType(f"lerobot.{room}")
+        modules[f"lerobot.{room}"].__dict__.update(
             {name: _device(name), f"{name}Config": _config()}
         )
-    made["lerobot.teleoperators.utils"] = ModuleType("lerobot.teleoperators.utils")
-    made["lerobot.teleoperators.utils"].__dict__["TeleopEvents"] = TeleopEvents
+    modules["lerobot.teleoperators.utils"] = ModuleType("lerobot.teleoperators.utils")
+    modules["lerobot.teleoperators.utils"].__dict__["TeleopEvents"] = TeleopEvents
     for error in ("DeviceNotConnectedError", "DeviceAlreadyConnectedError"):
-        made["lerobot.utils.errors"].__dict__[error] = type(error, (ConnectionError,), {})
-    return made
+        modules["lerobot.utils.errors"].__dict__[error] = type(error, (ConnectionError,), {})
+    return modules
 
 
 @contextmanager

@@ -127,8 +127,8 @@ def test_a_dataset_has_the_actions_the_plugin_accepts(
     assert about["actions"] == actions
     frames = pl.read_parquet(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
     q = log[site].q[:: log[site].rate_hz // 100].tolist()
-    place = scenario.arms[site].end_effector if actions == "tip" else tuple
-    wanted = np.array([place(row) for row in q], dtype=np.float32)
+    hand_goal = scenario.arms[site].end_effector if actions == "tip" else tuple
+    wanted = np.array([hand_goal(row) for row in q], dtype=np.float32)
     assert frames[f"action.{site}"].to_numpy() == pytest.approx(wanted[: len(frames)], abs=1e-6)
 
 
@@ -166,7 +166,7 @@ def test_a_policy_gets_both_states_at_its_rate(
     their keys.
     """
     now_s = 0.0
-    sent, asked = list[Any](), list[float]()
+    sent, request_times_s = list[Any](), list[float]()
 
     def sleep(time_s: float) -> None:
         nonlocal now_s
@@ -174,7 +174,7 @@ def test_a_policy_gets_both_states_at_its_rate(
 
     def decide(state: dict[str, list[float]]) -> list[float]:
         nonlocal now_s
-        asked.append(now_s)
+        request_times_s.append(now_s)
         now_s += 0.01
         assert list(state) == ["observation.state", "observation.environment_state"]
         assert list(state.values()) == 2 * [[1.0, 2.0]]
@@ -189,7 +189,7 @@ def test_a_policy_gets_both_states_at_its_rate(
         send_action=sent.append,
     )
     assert found_plugins[ROBOT].run_policy(robot, decide, 0.5, 10) == 5
-    assert asked == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert request_times_s == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert sent == 5 * [{"x.pos": 3.0, "y.pos": 4.0}]
 
 

@@ -80,7 +80,7 @@ class HeldArm:
         self.holds = False
 
     def move(self, *goal: float) -> int:
-        if any(abs(one) > 1e6 for one in goal):
+        if any(abs(coordinate) > 1e6 for coordinate in goal):
             raise UsageError("is beyond the arm")
         self.goals.append(goal)
         self.holds = True
@@ -370,11 +370,11 @@ def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
         place = base.apply([where.x, where.y, where.z])
         place += [transform.translation.x, transform.translation.y, transform.translation.z]
         turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
-        apart = [
+        distances = [
             max(np.abs(at - place).max(), (way.inv() * turned).magnitude())
             for at, way in compose(frames, site)
         ]
-        assert min(apart) < 1e-7
+        assert min(distances) < 1e-7
 
 
 def shares(*numbers: float) -> bytes:
@@ -388,11 +388,11 @@ def shares(*numbers: float) -> bytes:
 
 
 def test_shares_are_requested_once_and_refusals_are_reported() -> None:
-    asked: list[dict[str, float]] = []
+    requests: list[dict[str, float]] = []
     said: list[str] = []
 
     def change(wanted: dict[str, float]) -> None:
-        asked.append(wanted)
+        requests.append(wanted)
         if sum(wanted.values()) != 1.0:
             raise RunFailed("must sum to 1")
 
@@ -412,7 +412,7 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
         take(data, FIRST)
         ask()
         ask()
-    assert asked == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
+    assert requests == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
     assert said == [
         "refused: t/s/set_dominance must sum to 1",
         "refused: t/s/set_dominance has 1 number, but needs one weight for each peer: m1, m2",
@@ -423,7 +423,7 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
     clock.sleep_until(2 * SENDER_TIMEOUT_NS)
     take(shares(0.5, 0.1), FIRST)
     ask()
-    assert asked[2:] == [{"m1": 0.5, "m2": 0.1}]
+    assert requests[2:] == [{"m1": 0.5, "m2": 0.1}]
 
 
 @given(
@@ -709,8 +709,8 @@ def test_a_new_session_is_shown_with_its_epoch() -> None:
     with sites.shown():
         assert sites.seconds() == {2 * 10**9}
     assert sites.anew == [True, False]
-    told = ["waiting for session 't' to begin", "session t is in the graph of ROS 2: /t/..."]
-    assert sites.said == told * 2
+    texts = ["waiting for session 't' to begin", "session t is in the graph of ROS 2: /t/..."]
+    assert sites.said == texts * 2
 
 
 def test_earlier_changes_of_shares_are_shown() -> None:
@@ -720,8 +720,8 @@ def test_earlier_changes_of_shares_are_shown() -> None:
     )
     sites.begin(10**18)
     with sites.shown():
-        (told,) = until(lambda: sites.graph.came["t/s/dominance"])
-        assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [
+        (ramp,) = until(lambda: sites.graph.came["t/s/dominance"])
+        assert ROS.deserialize_cdr(ramp, "std_msgs/msg/Float64MultiArray").data.tolist() == [
             0.75,
             0.25,
         ]
@@ -798,7 +798,7 @@ RVIZ_TYPES = {
 def list_rviz_topics(config: Path) -> dict[str, tuple[str, bool]]:
     """Returns, for every topic of an RViz configuration, the type and whether the topic must be latched."""
     manager = YAML(typ="safe").load(config)["Visualization Manager"]
-    found = {}
+    types = {}
     for display in manager["Displays"]:
         topic = display.get("Topic") or display.get("Description Topic")
         if topic is None:
@@ -806,8 +806,8 @@ def list_rviz_topics(config: Path) -> dict[str, tuple[str, bool]]:
             continue
         latched = topic["Durability Policy"] == "Transient Local"
         assert topic["Value"].startswith("/")
-        found[topic["Value"][1:]] = RVIZ_TYPES[display["Class"]], latched
-    return found
+        types[topic["Value"][1:]] = RVIZ_TYPES[display["Class"]], latched
+    return types
 
 
 @pytest.mark.parametrize(
@@ -822,11 +822,11 @@ def test_rviz_has_the_topics_of_the_live_bridge(tmp_path: Path, name: str, namin
         SiteTopics(ends, scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
     config = tmp_path / "view.rviz"
     write_session_config(ends, scenario, config)
-    shown = list_rviz_topics(config)
-    assert shown.items() <= graph.offered.items()
+    types = list_rviz_topics(config)
+    assert types.items() <= graph.offered.items()
     poses = {topic for topic, (kind, _) in graph.offered.items() if kind == cdr.POSE}
     arms = {f"{name}/{site}/robot_description" for site in scenario.names}
-    assert shown.keys() == poses | arms
+    assert types.keys() == poses | arms
 
 
 def test_the_fixed_frame_of_rviz_is_the_root(tmp_path: Path) -> None:
@@ -844,9 +844,9 @@ def test_a_bag_and_a_log_share_one_view(tmp_path: Path) -> None:
     bag = trilat_net.export(log, "ros2", tmp_path / "bag.mcap")
     for path in (file, bag):
         trilat_net.view(path, rviz=True)
-    shown = list_rviz_topics(tmp_path / "run.rviz")
-    assert shown == list_rviz_topics(tmp_path / "bag.rviz")
-    assert shown.items() <= list_bag(bag).items()
+    types = list_rviz_topics(tmp_path / "run.rviz")
+    assert types == list_rviz_topics(tmp_path / "bag.rviz")
+    assert types.items() <= list_bag(bag).items()
     with pytest.raises(UsageError, match="already exists"):
         trilat_net.view(bag, rviz=True)
 

@@ -219,12 +219,12 @@ def test_free_impedance_is_that_of_coupled_arms() -> None:
     q, _ = rest_in_contact(K, TASKS["contact"].settings)
     cosine = np.cos(q[1])
     M = np.array([[3.0 + 2.0 * cosine, 1.0 + cosine], [1.0 + cosine, 1.0]])
-    one = np.eye(2)
+    identity = np.eye(2)
     coupling = K * np.exp(-4e-3 * s)
-    slave = M * s**2 + (d * s + K) * one
-    user = M * s**2 + ((d + 0.5) * s + K) * one - coupling**2 * np.linalg.inv(slave)
+    slave = M * s**2 + (d * s + K) * identity
+    user = M * s**2 + ((d + 0.5) * s + K) * identity - coupling**2 * np.linalg.inv(slave)
     jacobian = reach(q)[1]
-    motion = np.linalg.solve(user + (5.0 * s + 50.0) * one, jacobian[0])
+    motion = np.linalg.solve(user + (5.0 * s + 50.0) * identity, jacobian[0])
     force = np.linalg.solve(jacobian.T, user @ motion)
     expected = abs(force[0] / (s * (jacobian @ motion)[0]))
     run = run_bench_task(BenchRunItem(with_gains(cell, K=K, d=d), 1))
@@ -290,10 +290,10 @@ def test_an_interrupted_confirmation_resumes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Every run is repeated once over twice its length, and no finished run a second time."""
-    made: list[float] = []
+    repeated: list[float] = []
 
     def run(item: BenchRunItem) -> BenchRun:
-        made.append(item.to_s)
+        repeated.append(item.to_s)
         return make_run(
             item.cell,
             item.seed,
@@ -303,24 +303,24 @@ def test_an_interrupted_confirmation_resumes(
             to_s=item.to_s,
         )
 
-    shown: list[int] = []
+    counts: list[int] = []
 
     def stop(done: int, _total: int) -> None:
-        shown.append(done)
-        if len(shown) == 4:  # the first of three repetitions
+        counts.append(done)
+        if len(counts) == 4:  # the first of three repetitions
             raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_run, "run_bench_task", run)
     folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
         run_bench(folder, on=executor, progress=stop)
-    assert made.count(0.0) == 3
-    before = len(made)
+    assert repeated.count(0.0) == 3
+    before = len(repeated)
     with ThreadPoolExecutor(1) as executor:
         results = run_bench(
             prepare_bench_folder(plan_small_suite(), tmp_path / "suite"), on=executor
         )
-    assert made[before:] == [60.0, 60.0]
+    assert repeated[before:] == [60.0, 60.0]
     assert [(one.confirmed, one.length_s) for one in results.runs] == [(True, 60.0)] * 3
 
 
@@ -391,8 +391,8 @@ def test_a_longer_run_refutes_or_confirms() -> None:
 
 def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = {
-        key: msgspec.structs.replace(one, gains={}) if one.law == "pd_d" else one
-        for key, one in read_gains().items()
+        key: msgspec.structs.replace(gains, gains={}) if gains.law == "pd_d" else gains
+        for key, gains in read_gains().items()
     }
     monkeypatch.setattr(bench_plan, "read_gains", lambda: kept)
     plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
@@ -482,9 +482,9 @@ def make_cell_result(*errors: float | None) -> BenchCellResult:
 
 def test_intervals_over_twenty_seeds_equal_scipys() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
-    found: Any = make_cell_result(*errors).compute_mean("error_rad")
+    mean: Any = make_cell_result(*errors).compute_mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
-    assert (found.mean - found.half, found.mean + found.half) == pytest.approx(
+    assert (mean.mean - mean.half, mean.mean + mean.half) == pytest.approx(
         (low, high), rel=1e-12
     )
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
@@ -503,12 +503,12 @@ FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
 
 @pytest.mark.parametrize("cell", FULL.cells, ids=lambda cell: f"{cell.task}/{cell.law}")
 def test_every_law_fits_each_of_its_tasks(cell: BenchCell) -> None:
-    found = cell.build(1)
-    assert {site.control.__struct_config__.tag for site in found.scenario.sites.values()} == {
-        cell.law
-    }
-    assert len(found.scenario.names) == (2 if cell.form == "two" else 3)
-    assert np.allclose(found.scenario.alpha.sum(axis=1), 1.0)
+    experiment = cell.build(1)
+    assert {
+        site.control.__struct_config__.tag for site in experiment.scenario.sites.values()
+    } == {cell.law}
+    assert len(experiment.scenario.names) == (2 if cell.form == "two" else 3)
+    assert np.allclose(experiment.scenario.alpha.sum(axis=1), 1.0)
 
 
 def test_every_link_fits_both_forms() -> None:
@@ -539,7 +539,7 @@ def test_all_studies_have_gains_within_their_ranges() -> None:
 @pytest.mark.long
 def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
     tuning = tune_laws({"level": ["p_d"]}, 1, budget=4)
-    assert [one.round_trip_ms for one in tuning] == list(TUNED_ROUND_TRIPS_MS)
+    assert [gains.round_trip_ms for gains in tuning] == list(TUNED_ROUND_TRIPS_MS)
     settings = format_settings(build_settings("level", "contact", "rtt272"))
     (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
     places = [
@@ -583,12 +583,12 @@ def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float
 
 def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Gains are stored one by one, and gains that are up to date are not tuned again."""
-    path, made = tmp_path / "gains.json", []
+    path, tuned_names = tmp_path / "gains.json", []
 
     def tune(form: str, law: str, round_trip_ms: int, *_: Any) -> TunedGains:
-        if len(made) == 2:
+        if len(tuned_names) == 2:
             raise KeyboardInterrupt
-        made.append(round_trip_ms)
+        tuned_names.append(round_trip_ms)
         mark = fingerprint_tuning(form, law, round_trip_ms)
         return TunedGains(form, law, round_trip_ms, {"K": 1.0}, 1, 1, 0, 0.1, 1.0, mark)
 
@@ -603,9 +603,9 @@ def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path
     with pytest.raises(KeyboardInterrupt):
         go_on()
     assert len(read_gains(path)) == 2
-    made.clear()
+    tuned_names.clear()
     assert len(go_on()) == 3
-    assert made == [TUNED_ROUND_TRIPS_MS[-1]]
+    assert tuned_names == [TUNED_ROUND_TRIPS_MS[-1]]
 
 
 class Damped(BUILT_IN["p_d"]):
@@ -680,13 +680,13 @@ def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path
     first = run_bench(
         prepare_bench_folder(plan_small_suite(links=["rtt8"]), tmp_path / "one"), jobs=1
     )
-    made: list[int] = []
+    finished: list[int] = []
     more = run_bench(
         prepare_bench_folder(plan_small_suite(), tmp_path / "one"),
         jobs=1,
-        progress=lambda done, _: made.append(done),
+        progress=lambda done, _: finished.append(done),
     )
-    assert made == [2, 3]
+    assert finished == [2, 3]
     assert more.runs == whole.runs
     assert more.runs[0] == first.runs[0]
     gains = {"K": 20.0, "d": 5.0}

@@ -28,7 +28,7 @@ def test_part_of_suite_leaves_results_and_resumes(tmp_path: Path) -> None:
     assert "note: 2 cells, 3 runs, into runs/bench-round-trips" in done.err
     facts = json.loads(done.out)
     assert is_documented("bench", facts)
-    assert [place["runs"] for place in facts["places"]] == [1, 2]
+    assert [cell["runs"] for cell in facts["places"]] == [1, 2]
     folder = tmp_path / "runs" / "bench-round-trips"
     with (folder / "places.csv").open() as stream:
         rows = list(csv.DictReader(stream))

@@ -38,8 +38,8 @@ def test_a_sweep_prints_plan_outcome_and_next_step(folder: Path, tmp_path: Path)
     again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
     assert verdicts in again
     for line in (line for line in again if line.startswith("  trilat sweep ")):
-        words = line.partition("#")[0].split()
-        trilat(*words[1:], "--jobs", "1", cwd=tmp_path).succeeds()
+        arguments = line.partition("#")[0].split()
+        trilat(*arguments[1:], "--jobs", "1", cwd=tmp_path).succeeds()
 
 
 def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
@@ -149,13 +149,20 @@ def test_redrawn_results_are_the_same(folder: Path) -> None:
 
 @pytest.mark.long
 def test_margins_are_printed_and_kept(folder: Path) -> None:
-    asked = ("--over", "link.delay_ms=0,40", "--margin", "control.Kd=1:4", "--tolerance", "0.1")
+    arguments = (
+        "--over",
+        "link.delay_ms=0,40",
+        "--margin",
+        "control.Kd=1:4",
+        "--tolerance",
+        "0.1",
+    )
     text = trilat(
-        "sweep", "trio.toml", *asked, "--jobs", "1", "-o", "edges", cwd=folder
+        "sweep", "trio.toml", *arguments, "--jobs", "1", "-o", "edges", cwd=folder
     ).succeeds()
     assert "edge of Kd (N m s/rad)" in text
     facts = json.loads((folder / "edges" / "margin.json").read_text())
-    assert [place["link.delay_ms"] for place in facts["places"]] == [0.0, 40.0]
+    assert [point["link.delay_ms"] for point in facts["places"]] == [0.0, 40.0]
     assert (folder / "edges" / "margin.md").read_text().startswith("# ")
     words = facts["command"].split()
     assert words[:3] == ["trilat", "sweep", "trio.toml"]

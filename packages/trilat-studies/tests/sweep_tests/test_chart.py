@@ -65,10 +65,10 @@ def test_every_panel_has_its_own_lines() -> None:
 @pytest.mark.long
 def test_lines_depend_on_neither_runs_nor_processes() -> None:
     everything = results()
-    one = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
+    fewer = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
     (closed, rooted), (again, other) = (
         build_stability_map(some, (), jobs).lines[0]
-        for some, jobs in ((everything, 1), (one, 2))
+        for some, jobs in ((everything, 1), (fewer, 2))
     )
     assert (closed.rank, rooted.rank) == (0, 1)
     assert np.array_equal(closed.excess, again.excess)
@@ -108,8 +108,8 @@ def test_coarse_map_has_the_exact_linear_line() -> None:
 
 def test_a_strip_has_no_lines() -> None:
     plan = plan_sweep("p_d_margin", over=OVER[:1])
-    made = [row for row in rows() if row["control.d"] == 0.7]
-    assert build_stability_map(SweepResults(plan, made), ()).lines == ((),)
+    rows_of_strip = [row for row in rows() if row["control.d"] == 0.7]
+    assert build_stability_map(SweepResults(plan, rows_of_strip), ()).lines == ((),)
 
 
 def test_place_of_panel_is_cell_of_plan() -> None:
@@ -164,9 +164,9 @@ def test_the_line_is_half_stiffness_times_delay() -> None:
     """No d of the map is little enough for no delay, or enough for 800 ms."""
     line = trace_closed_form(at, DELAY, DAMPING)
     assert line is not None
-    found = [line.crossings(column, DAMPING) for column in range(6)]
-    assert [len(some) for some in found] == [0, 1, 1, 1, 1, 0]
-    assert np.allclose([some[0] for some in found[1:5]], [0.5, 1.0, 1.5, 2.0], rtol=1e-9)
+    crossings = [line.crossings(column, DAMPING) for column in range(6)]
+    assert [len(some) for some in crossings] == [0, 1, 1, 1, 1, 0]
+    assert np.allclose([some[0] for some in crossings[1:5]], [0.5, 1.0, 1.5, 2.0], rtol=1e-9)
     assert (line.excess > 0.0)[-1, 0]
     assert not (line.excess > 0.0)[0, -1]
 

@@ -75,15 +75,15 @@ def test_different_runs_have_different_verdicts(tmp_path: Path) -> None:
 
 def test_a_session_lasts_as_long_as_its_cell(tmp_path: Path) -> None:
     """This also holds for an extended cell; a diverged cell has half a second more in order to diverge."""
-    asked: list[float] = []
+    durations_s: list[float] = []
 
     def run(scenario: Scenario, _: str) -> tuple[Path, Sequence[str]]:
-        asked.append(scenario.duration_s)
+        durations_s.append(scenario.duration_s)
         return tmp_path / "none.mcap", ["failed"]
 
     for changes in ({"ran_s": 8.0}, {"ran_s": 2.5, "diverged_s": 2.5}):
         confirm_cell({**cell(CALM), **changes}, run)
-    assert asked == [8.0, 3.0]
+    assert durations_s == [8.0, 3.0]
 
 
 def test_a_failed_run_confirms_nothing(tmp_path: Path) -> None:
@@ -111,19 +111,19 @@ def stable(row: Row) -> bool | None:
 
 
 def test_equally_many_cells_lie_on_either_side() -> None:
-    every = list(rows())
-    cells = choose_cells_near_edges(every, KEYS, 3)
+    all_rows = list(rows())
+    cells = choose_cells_near_edges(all_rows, KEYS, 3)
     assert [stable(row) for row in cells] == [True] * 3 + [False] * 3
     assert len({row["cell"] for row in cells}) == 6
     for row in cells:
         delay, d = row[KEYS[0]], row[KEYS[1]]
         near = [
             one
-            for one in every
+            for one in all_rows
             if (abs(one[KEYS[0]] - delay), round(abs(one[KEYS[1]] - d), 9))
             in ((100, 0.0), (0, 0.5))
         ]
-        assert any(stable(one) is not stable(row) for one in near)
+        assert any(stable(neighbour) is not stable(row) for neighbour in near)
 
 
 def test_cells_are_spread_over_the_edge() -> None:
@@ -171,9 +171,9 @@ def test_long_cells_give_way_to_the_next() -> None:
         lasting(row, lambda row: 160.0 if stable(row) and row["cell"] in edge else 20.0)
         for row in rows()
     ]
-    found = [row for row in choose_cells_near_edges(late, KEYS, 2) if stable(row)]
-    assert len(found) == 2
-    assert all(row["ran_s"] == 20.0 for row in found)
+    rows_taken = [row for row in choose_cells_near_edges(late, KEYS, 2) if stable(row)]
+    assert len(rows_taken) == 2
+    assert all(row["ran_s"] == 20.0 for row in rows_taken)
     with pytest.raises(UsageError, match="stable side of an edge ran longer than 60 s"):
         choose_cells_near_edges([lasting(row, lambda _: 160.0) for row in rows()], KEYS, 10)
 
@@ -184,8 +184,10 @@ def test_zero_is_no_number_of_cells() -> None:
 
 
 def test_table_has_both_verdicts_and_the_log(tmp_path: Path) -> None:
-    found = [confirm_cell(cell(CALM), runner(tmp_path, instead=one)) for one in (CALM, WILD)]
-    grid = tabulate_confirmations(found, KEYS)
+    confirmations = [
+        confirm_cell(cell(CALM), runner(tmp_path, instead=run)) for run in (CALM, WILD)
+    ]
+    grid = tabulate_confirmations(confirmations, KEYS)
     assert [row[grid.headers.index("virtual")] for row in grid.rows] == ["converged"] * 2
     assert [row[grid.headers.index("live")] for row in grid.rows] == ["converged", "diverged"]
     assert [row[-3] for row in grid.rows] == ["same", "DIFFERS"]

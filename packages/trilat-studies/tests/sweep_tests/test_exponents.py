@@ -87,8 +87,8 @@ def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> N
 
 def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
-    made = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
-    plane = build_plane(made, KEYS, P_D)
+    shifted = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
+    plane = build_plane(shifted, KEYS, P_D)
     figure = draw_stability_map(plane, ((),), make_print_size(3.5))
     mesh: Any = next(
         collection
@@ -104,9 +104,9 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
 
 
 def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
-    made = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
-    made[0] |= {"exponent_per_s": None}
-    exponents = build_plane(made, KEYS, P_D).panels[0].exponents_per_s
+    seeded = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
+    seeded[0] |= {"exponent_per_s": None}
+    exponents = build_plane(seeded, KEYS, P_D).panels[0].exponents_per_s
     assert np.isnan(exponents[0, 0])
     assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
     assert not build_plane(list(rows()), KEYS, P_D).judged_by_twins

@@ -90,8 +90,8 @@ def test_another_arithmetic_or_program_is_refused(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
-        words = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
-        assert words in refused(sweep_folder)
+        reason = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
+        assert reason in refused(sweep_folder)
     older = {**collect_provenance(), "version_numba": "0.1"}
     monkeypatch.setattr(folders, "collect_provenance", lambda: older)
     with pytest.raises(UsageError, match=r"another version of the program: .*numba 0\.1"):

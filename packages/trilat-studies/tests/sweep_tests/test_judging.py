@@ -48,18 +48,18 @@ def test_verdict_and_numbers_are_those_of_a_log(run: str) -> None:
     virtual.write_virtual_log(scenario, stream)
     stream.seek(0)
     log = open_log(stream)
-    found, certificate = judge_result(scenario), certify_run(log)
+    result, certificate = judge_result(scenario), certify_run(log)
     expected = certificate.end
-    assert found.motion is expected.behaviour
-    assert found.verdict is classify_decision(certificate.stability, expected.behaviour)
-    assert found.stability == certificate.stability
-    assert (found.end_error_rad, found.end_speed_rad_s) == (
+    assert result.motion is expected.behaviour
+    assert result.verdict is classify_decision(certificate.stability, expected.behaviour)
+    assert result.stability == certificate.stability
+    assert (result.end_error_rad, result.end_speed_rad_s) == (
         expected.end_error_rad,
         expected.end_speed_rad_s,
     )
     rate = expected.error.rate_per_s
-    assert found.error_rate_per_s == (None if math.isnan(rate) else rate)
-    assert found.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
+    assert result.error_rate_per_s == (None if math.isnan(rate) else rate)
+    assert result.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
 
 
 @pytest.mark.parametrize(
@@ -96,34 +96,34 @@ def test_an_undecided_run_continues_as_longer_run() -> None:
     changes = {"control.d": 0.95, "duration_s": 4.0}
     scenario = load_scenario("p_d_margin", changes)
     assert not is_conclusive(judge_result(scenario))
-    found = judge_result(scenario, longest_s=256.0)
-    assert found.verdict is CellClass.DIVERGED
-    assert found.extended > 0
-    assert found.ran_s == 4.0 * 2**found.extended
-    whole = judge_result(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
+    result = judge_result(scenario, longest_s=256.0)
+    assert result.verdict is CellClass.DIVERGED
+    assert result.extended > 0
+    assert result.ran_s == 4.0 * 2**result.extended
+    whole = judge_result(load_scenario("p_d_margin", {**changes, "duration_s": result.ran_s}))
     totals = FusedRun(scenario)  # those of the scenario's own duration
     totals.advance_to(4.0)
     assert (
-        msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict())
-        == found
+        msgspec.structs.replace(whole, extended=result.extended, **totals.totals._asdict())
+        == result
     )
 
 
 def test_slow_trends_under_random_links_decide_nothing() -> None:
     """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
-    found = judge_result(
+    result = judge_result(
         load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}),
         longest_s=160.0,
     )
-    assert found.verdict is not CellClass.CONVERGED
-    assert found.end_speed_rad_s > 5.0
+    assert result.verdict is not CellClass.CONVERGED
+    assert result.end_speed_rad_s > 5.0
 
 
 def test_no_run_is_extended_beyond_its_limit() -> None:
     scenario = load_scenario("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
-    found = judge_result(scenario, longest_s=10.0)
-    assert (found.ran_s, found.extended) == (10.0, 2)
-    assert not is_conclusive(found)
+    result = judge_result(scenario, longest_s=10.0)
+    assert (result.ran_s, result.extended) == (10.0, 2)
+    assert not is_conclusive(result)
 
 
 @pytest.mark.parametrize("d", [0.95, 1.05])
@@ -133,9 +133,9 @@ def test_few_per_cent_beside_edge_verdicts_are_right(d: float) -> None:
     Runs of 160 s decide where runs of 20 s cannot.
     """
     scenario = load_scenario("p_d_margin", {"control.d": d, "duration_s": 20.0})
-    found = judge_result(scenario, longest_s=160.0)
-    assert found.extended > 0
-    assert found.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
+    result = judge_result(scenario, longest_s=160.0)
+    assert result.extended > 0
+    assert result.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
 
 
 @pytest.mark.parametrize(
@@ -147,20 +147,20 @@ def test_roots_decide_for_arms_that_hardly_move(d: float, verdict: CellClass) ->
         f"sites.{name}.q0_rad": [-0.6, 1.8 + off]
         for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
     }
-    found = judge_result(
+    result = judge_result(
         load_scenario(
             "p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}
         )
     )
-    assert found.verdict is verdict
+    assert result.verdict is verdict
 
 
 def test_a_run_that_diverges_says_when() -> None:
-    found = judge_result(load_scenario(*RUNS["diverged"]), longest_s=100.0)
-    assert found.motion is EndBehaviour.DIVERGED
-    assert found.diverged_s == found.ran_s
-    assert found.extended == 0
-    assert found.end_speed_rad_s > 5.0
+    result = judge_result(load_scenario(*RUNS["diverged"]), longest_s=100.0)
+    assert result.motion is EndBehaviour.DIVERGED
+    assert result.diverged_s == result.ran_s
+    assert result.extended == 0
+    assert result.end_speed_rad_s > 5.0
 
 
 def test_trials_see_no_roots_but_certificates_do() -> None:

@@ -65,8 +65,8 @@ def keys(journal: Path) -> list[tuple[int, int]]:
         for line in journal.read_bytes().splitlines()
         if re.fullmatch(rb"{.*}\t[0-9a-f]{8}", line)
     ]
-    found = [msgspec.json.decode(line.partition(b"\t")[0]) for line in whole]
-    return [(one["cell"], one["seed"]) for one in found]
+    entries = [msgspec.json.decode(line.partition(b"\t")[0]) for line in whole]
+    return [(entry["cell"], entry["seed"]) for entry in entries]
 
 
 @pytest.mark.long
@@ -91,5 +91,5 @@ def test_killed_and_interrupted_sweeps_resume_to_equal_bytes(tmp_path: Path) -> 
     text = trilat("sweep", *sweep, "parts", "--jobs", "2", cwd=tmp_path).succeeds()
     assert f"{kept} runs are done already" in text
     assert (parts / "results.csv").read_bytes() == (tmp_path / "whole/results.csv").read_bytes()
-    made = keys(parts / JOURNAL_FILE)
-    assert len(made) == len(set(made)) == RUNS
+    run_keys = keys(parts / JOURNAL_FILE)
+    assert len(run_keys) == len(set(run_keys)) == RUNS

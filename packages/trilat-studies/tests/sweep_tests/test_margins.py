@@ -58,19 +58,19 @@ def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("by_the_line")
 def test_a_place_has_its_edge_beside_theory() -> None:
-    (one,) = search_margins(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1)
-    assert one.cell.values == (200.0,)
-    (span,) = one.margin.spans
+    (point,) = search_margins(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1)
+    assert point.cell.values == (200.0,)
+    (span,) = point.margin.spans
     assert span.low <= 1.0 <= span.high
-    assert one.closed == pytest.approx(1.0)
-    assert one.linear == (pytest.approx(1.0, rel=0.04),)
-    assert one.remark == ""
+    assert point.closed == pytest.approx(1.0)
+    assert point.linear == (pytest.approx(1.0, rel=0.04),)
+    assert point.remark == ""
 
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
 def test_seeds_are_places_where_links_are_random() -> None:
     lossy = search_margins(plan_margin_sweep("link.loss=0,0.1", seeds=2), WITHIN, 1)
-    assert [(one.cell.values, one.seed) for one in lossy] == [
+    assert [(point.cell.values, point.seed) for point in lossy] == [
         ((0.0,), 1),
         ((0.1,), 1),
         ((0.1,), 2),
@@ -108,13 +108,13 @@ def make_point_margin(*spans: StabilityEdge, stable: bool | None = None) -> Grid
 
 def test_table_shows_edges_islands_and_missing_edges() -> None:
     edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
-    every = [
+    points = [
         make_point_margin(*edges),
         make_point_margin(stable=True),
         make_point_margin(stable=False),
         make_point_margin(),
     ]
-    grid = SweepMargins(plan_margin_sweep(), WITHIN, every).table()
+    grid = SweepMargins(plan_margin_sweep(), WITHIN, points).table()
     edge = grid.headers.index("edge of d (N m s/rad)")
     assert [row[edge] for row in grid.rows] == [
         "0.49 to 0.492",
@@ -129,7 +129,7 @@ def test_table_shows_edges_islands_and_missing_edges() -> None:
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
     assert (
         "not monotone at 1 of 2 grid points"
-        in SweepMargins(plan_margin_sweep(), WITHIN, every[:2]).page()
+        in SweepMargins(plan_margin_sweep(), WITHIN, points[:2]).page()
     )
 
 
@@ -144,10 +144,10 @@ def test_the_facts_are_json_and_name_the_command() -> None:
     assert facts["command"].endswith(
         "--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005"
     )
-    (place,) = facts["places"]
-    assert place.pop("link.delay_ms") == 100.0
+    (point,) = facts["places"]
+    assert point.pop("link.delay_ms") == 100.0
     assert is_documented("sweep --margin", facts)
-    assert place["edges"] == [
+    assert point["edges"] == [
         {"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}
     ]
 
@@ -171,20 +171,20 @@ def test_a_range_is_read_as_written() -> None:
 def test_an_edge_is_enclosed_to_the_tolerance(
     edge: float, above: bool, tolerance: float
 ) -> None:
-    asked = []
+    values = []
 
     def stable(value: float) -> bool:
-        asked.append(value)
+        values.append(value)
         return (value > edge) is above
 
-    found = search_key_margin(stable, 0.2, 3.0, tolerance)
-    (span,) = found.spans
+    margin = search_key_margin(stable, 0.2, 3.0, tolerance)
+    (span,) = margin.spans
     assert span.low <= edge <= span.high
     assert span.high - span.low <= tolerance * span.high
     assert span.stable_below is not above
     assert span.sharp
-    assert found.runs == len(asked) == len(set(asked))
-    assert found.runs <= SCAN_POINTS + 1 + math.log2(
+    assert margin.runs == len(values) == len(set(values))
+    assert margin.runs <= SCAN_POINTS + 1 + math.log2(
         2.8 / (SCAN_POINTS - 1) / (0.2 * tolerance)
     )
 
@@ -196,31 +196,31 @@ def test_an_undecided_part_is_the_reported_interval(
     def stable(value: float) -> bool | None:
         return None if abs(value - edge) < width else (value > edge) is above
 
-    found = search_key_margin(stable, 0.2, 3.0, 0.01)
-    (span,) = found.spans
+    margin = search_key_margin(stable, 0.2, 3.0, 0.01)
+    (span,) = margin.spans
     assert span.low <= edge - width + 1e-9
     assert edge + width - 1e-9 <= span.high
     if span.sharp:
         assert span.high - span.low <= 0.01 * span.high
     else:
-        assert found.undecided > 0
+        assert margin.undecided > 0
         assert (edge - width) - span.low <= 0.01 * span.high
         assert span.high - (edge + width) <= 0.01 * span.high
 
 
 @pytest.mark.parametrize("side", [True, False, None])
 def test_without_change_only_the_side_is_reported(side: bool | None) -> None:
-    found = search_key_margin(lambda _: side, 0.2, 3.0)
-    assert (found.spans, found.stable, found.runs) == ((), side, SCAN_POINTS)
+    margin = search_key_margin(lambda _: side, 0.2, 3.0)
+    assert (margin.spans, margin.stable, margin.runs) == ((), side, SCAN_POINTS)
 
 
 def test_an_island_has_two_edges() -> None:
-    found = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
-    first, second = found.spans
+    margin = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
+    first, second = margin.spans
     assert first.low <= 1.0 <= first.high
     assert second.low <= 1.9 <= second.high
     assert (first.stable_below, second.stable_below) == (True, False)
-    assert found.stable is None
+    assert margin.stable is None
 
 
 @given(st.floats(20.2, 299.8))

@@ -28,8 +28,8 @@ def find_log_metric(log: Log, key: str) -> float | None:
 
 
 def test_metrics_of_a_cell_equal_its_logs(tmp_path: Path) -> None:
-    found = run_metric_sweep(tmp_path / "o", duration_s=0.5, longest_s=0.5)
-    for row in found.rows:
+    results = run_metric_sweep(tmp_path / "o", duration_s=0.5, longest_s=0.5)
+    for row in results.rows:
         delay = row["link.delay_ms"]
         log = trilat_net.simulate("two_sites", {"duration_s": 0.5, "link.delay_ms": delay})
         assert {key: row[key] for key in KEYS} == {
@@ -53,9 +53,9 @@ def test_every_row_holds_metrics_under_their_keys(tmp_path: Path) -> None:
 
 
 def test_a_resumed_sweep_keeps_its_metrics(tmp_path: Path) -> None:
-    found = run_metric_sweep(tmp_path / "o")
-    assert read_results(tmp_path / "o").to_rows() == found.to_rows()
-    assert run_metric_sweep(tmp_path / "o").to_rows() == found.to_rows()
+    results = run_metric_sweep(tmp_path / "o")
+    assert read_results(tmp_path / "o").to_rows() == results.to_rows()
+    assert run_metric_sweep(tmp_path / "o").to_rows() == results.to_rows()
     with pytest.raises(UsageError, match=r"other metrics: there settle_s, .*, here none"):
         trilat_net.sweep("two_sites", AXIS, ["duration_s=0.5"], out=tmp_path / "o", jobs=1)
 

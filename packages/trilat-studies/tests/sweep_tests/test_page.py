@@ -130,9 +130,9 @@ def every(*point: Any) -> CellClass:
 
 
 def test_every_place_has_the_colour_of_its_verdict() -> None:
-    made = figure(make_plane(every))
-    made.canvas.draw()
-    (mesh,) = meshes(made)[:1]
+    figure_of_map = figure(make_plane(every))
+    figure_of_map.canvas.draw()
+    (mesh,) = meshes(figure_of_map)[:1]
     colours = mesh.get_facecolors().reshape(len(DAMPINGS), len(DELAYS_MS), 4)
     for i, d in enumerate(DAMPINGS):
         for j, delay in enumerate(DELAYS_MS):
@@ -159,10 +159,12 @@ def test_classes_differ_in_lightness() -> None:
 
 
 def test_lines_are_drawn_where_they_are_and_named() -> None:
-    made = figure(make_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
+    figure_of_lines = figure(
+        make_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1))
+    )
     first, second = (
         collection
-        for collection in made.axes[0].collections
+        for collection in figure_of_lines.axes[0].collections
         if isinstance(collection, QuadContourSet)
     )
     for line in (first, second):
@@ -170,7 +172,7 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
         assert np.allclose(ends[:, 1], 5e-3 * ends[:, 0])
         assert ends[:, 1].max() - ends[:, 1].min() > 2.0
     assert first.get_linestyle() != second.get_linestyle()
-    (legend,) = made.legends
+    (legend,) = figure_of_lines.legends
     words = [text.get_text() for text in legend.get_texts()]
     assert words == ["converged", "bounded oscillation", "$d$", "linear analysis"]
 
@@ -182,12 +184,12 @@ def test_the_legend_has_only_occurring_classes() -> None:
 
 def test_several_runs_show_their_share_with_a_scale() -> None:
     plane = make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4)
-    made = figure(plane, 7.0)
-    share = meshes(made)[0].get_array()
+    figure_of_runs = figure(plane, 7.0)
+    share = meshes(figure_of_runs)[0].get_array()
     assert share is not None
     assert np.allclose(np.ma.getdata(share), plane.panels[0].share)
-    assert "share of stable runs" in [axes.get_ylabel() for axes in made.axes]
-    texts = {text.get_text() for text in made.axes[0].texts}
+    assert "share of stable runs" in [axes.get_ylabel() for axes in figure_of_runs.axes]
+    texts = {text.get_text() for text in figure_of_runs.axes[0].texts}
     assert texts
     for i, j in np.argwhere((plane.panels[0].share > 0.0) & (plane.panels[0].share < 1.0)):
         assert f"{round(4 * plane.panels[0].share[i, j])}/4" in texts
@@ -197,12 +199,15 @@ def test_several_runs_show_their_share_with_a_scale() -> None:
 @pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
 def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) -> None:
     plane = make_plane(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
-    made = figure(plane, width_in, (LINE,))
-    assert made.get_figwidth() == width_in
-    assert [axes.get_title() for axes in made.axes if axes.collections] == [
+    figure_of_panels = figure(plane, width_in, (LINE,))
+    assert figure_of_panels.get_figwidth() == width_in
+    assert [axes.get_title() for axes in figure_of_panels.axes if axes.collections] == [
         p.title for p in plane.panels
     ]
-    labels = [made.get_supxlabel(), *(axes.get_xlabel() for axes in made.axes)]
+    labels = [
+        figure_of_panels.get_supxlabel(),
+        *(axes.get_xlabel() for axes in figure_of_panels.axes),
+    ]
     assert [text for text in labels if text] == ["delay (ms)"]
 
 
@@ -217,8 +222,8 @@ def test_a_place_without_run_is_no_verdict() -> None:
 
     from .maps import KEYS, P_D
 
-    made = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
-    classes = meshes(made)[0].get_array()
+    figure_of_gap = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
+    classes = meshes(figure_of_gap)[0].get_array()
     assert classes is not None
     assert int(np.ma.getmaskarray(classes).sum()) == 1
 
@@ -226,9 +231,9 @@ def test_a_place_without_run_is_no_verdict() -> None:
 def test_uneven_values_are_named_one_by_one() -> None:
     plane = make_plane()
     uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
-    made = figure(uneven)
-    made.canvas.draw()
-    assert [text.get_text() for text in made.axes[0].get_xticklabels()] == [
+    figure_of_values = figure(uneven)
+    figure_of_values.canvas.draw()
+    assert [text.get_text() for text in figure_of_values.axes[0].get_xticklabels()] == [
         "8",
         "68",
         "136",

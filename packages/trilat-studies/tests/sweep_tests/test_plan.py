@@ -62,7 +62,7 @@ VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
 def test_values_by_key_equal_axes_as_texts(
     delays: list[float], counts: list[int], as_array: bool
 ) -> None:
-    given = [np.array(one) if as_array else one for one in (delays, counts)]
+    given = [np.array(axes) if as_array else axes for axes in (delays, counts)]
     over = {
         "link.delay_ms": given[0],
         "control.d": given[1],
@@ -173,8 +173,8 @@ def test_invalid_axes_are_refused_before_any_run(
 
 
 def test_a_key_without_effect_is_refused(tmp_path: Path) -> None:
-    own = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
-    (tmp_path / "own.toml").write_text(own)
+    text = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
+    (tmp_path / "own.toml").write_text(text)
     problem = refused(str(tmp_path / "own.toml"), over=["control.Kd=1:3:1"])
     assert "control.Kd: 1 and 2 give the same experiment" in problem
     assert "sites.NAME.control" in problem

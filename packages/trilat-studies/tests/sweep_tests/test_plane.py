@@ -26,13 +26,15 @@ from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, judge_by_condition, make_plane
 @given(st.permutations(range(50)), st.integers(0, 2**16))
 def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> None:
     random = np.random.default_rng(chance)
-    made = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
-    plane = build_plane([made[n] for n in order], KEYS, P_D)
+    shuffled_rows = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
+    plane = build_plane([shuffled_rows[n] for n in order], KEYS, P_D)
     (panel,) = plane.panels
     assert panel.counts.sum() == 50
-    for row in made:
+    for row in shuffled_rows:
         i, j = DAMPINGS.index(row[KEYS[1]]), DELAYS_MS.index(row[KEYS[0]])
-        same = [r for r in made if (r[KEYS[0]], r[KEYS[1]]) == (row[KEYS[0]], row[KEYS[1]])]
+        same = [
+            r for r in shuffled_rows if (r[KEYS[0]], r[KEYS[1]]) == (row[KEYS[0]], row[KEYS[1]])
+        ]
         for n, verdict in enumerate(CELL_CLASSES):
             assert panel.counts[i, j, n] == sum(r["verdict"] == verdict for r in same)
 
@@ -44,9 +46,9 @@ def test_the_share_is_of_decided_runs() -> None:
         CellClass.UNDECIDED,
         CellClass.CONVERGED,
     )
-    found = make_plane(lambda *place: verdicts[place[-1] - 1], seeds=4)
-    assert np.allclose(found.panels[0].share, 2.0 / 3.0)
-    assert found.seeds == 4
+    plane = make_plane(lambda *place: verdicts[place[-1] - 1], seeds=4)
+    assert np.allclose(plane.panels[0].share, 2.0 / 3.0)
+    assert plane.seeds == 4
 
 
 def test_undecided_places_have_no_share() -> None:
@@ -54,22 +56,22 @@ def test_undecided_places_have_no_share() -> None:
 
 
 def test_words_and_further_axes_make_panels() -> None:
-    found = make_plane(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
-    assert [panel.title for panel in found.panels] == [
+    plane = make_plane(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
+    assert [panel.title for panel in plane.panels] == [
         "newest, playout 0 ms",
         "newest, playout 400 ms",
         "in order, playout 0 ms",
         "in order, playout 400 ms",
     ]
-    assert found.panels[1].settings == (("link.order", "newest"), ("link.playout_ms", 400.0))
-    assert {int(panel.counts.sum()) for panel in found.panels} == {
+    assert plane.panels[1].settings == (("link.order", "newest"), ("link.playout_ms", 400.0))
+    assert {int(panel.counts.sum()) for panel in plane.panels} == {
         len(DELAYS_MS) * len(DAMPINGS)
     }
 
 
 def test_an_axis_of_words_is_never_drawn() -> None:
-    made = list(rows(link__order=("newest", "in_order")))
-    plane = build_plane(made, ["link.order", *KEYS], P_D)
+    ordered_rows = list(rows(link__order=("newest", "in_order")))
+    plane = build_plane(ordered_rows, ["link.order", *KEYS], P_D)
     assert (plane.x.key, plane.y.key) == KEYS
     assert len(plane.panels) == 2
 
@@ -109,13 +111,13 @@ YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 def list_column_edges(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
     """Returns the edges of the first column of a map whose columns are alike."""
-    found = make_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
-    return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]
+    plane = make_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
+    return [edge for x, edge in find_map_edges(plane, plane.panels[0]) if x == DELAYS_MS[0]]
 
 
 def test_the_condition_lies_in_its_own_edges() -> None:
-    found = make_plane()
-    measured = find_map_edges(found, found.panels[0])
+    plane = make_plane()
+    measured = find_map_edges(plane, plane.panels[0])
     assert [x for x, _ in measured] == [100, 200, 300, 400]
     for x, edge in measured:
         assert edge.low <= 5e-3 * x <= edge.high
@@ -125,14 +127,18 @@ def test_the_condition_lies_in_its_own_edges() -> None:
 @pytest.mark.parametrize("column", list(itertools.product((YES, NO, UNKNOWN), repeat=5))[::7])
 def test_edges_separate_all_decided_places(column: tuple[CellClass, ...]) -> None:
     """From below, the side changes at every edge and nowhere else."""
-    found = list_column_edges(column)
+    edges = list_column_edges(column)
     side = [verdict.stable for verdict in column]
-    decided = [(d, one) for d, one in zip(DAMPINGS, side, strict=True) if one is not None]
+    decided = [
+        (d, is_stable)
+        for d, is_stable in zip(DAMPINGS, side, strict=True)
+        if is_stable is not None
+    ]
     changes = [
         (a, b) for (a, one), (b, other) in itertools.pairwise(decided) if one is not other
     ]
-    assert [(edge.low, edge.high) for edge in found] == changes
-    for edge in found:
+    assert [(edge.low, edge.high) for edge in edges] == changes
+    for edge in edges:
         assert edge.stable_below is (side[DAMPINGS.index(edge.low)])
 
 

@@ -76,15 +76,15 @@ def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> Non
 
 
 def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> None:
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
     rows = run_sweep(
-        prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: told.append(one)
+        prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: progress.append(one)
     ).results.rows
     seeds_of = [(row["cell"], row["seed"]) for row in rows]
     assert seeds_of == [(0, 1), *((1, seed) for seed in range(1, 6)), (2, 1)]
     assert [row["random"] for row in rows] == [False, *[True] * 5, False]
-    assert told == [(1, 3), (2, 3), (3, 3), (4, 7), (5, 7), (6, 7), (7, 7)]
+    assert progress == [(1, 3), (2, 3), (3, 3), (4, 7), (5, 7), (6, 7), (7, 7)]
     assert len(judge.texts) == 7
 
 

@@ -239,27 +239,27 @@ def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
 
 
 def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
-    assert [place.cell for place in points] == list(range(18))
-    assert [sum(place.counts) for place in points] == [1] * 3 + [12] * 15
-    for place in points:
-        converged, bounded, diverged, undecided = place.counts
-        assert (place.stable, place.decided) == (converged, converged + bounded + diverged)
-        assert place.decided + undecided == sum(place.counts)
-        assert place.doubtful == (0 < converged < place.decided)
-        assert place.interval == wilson_interval(converged, converged + bounded + diverged)
+    assert [point.cell for point in points] == list(range(18))
+    assert [sum(point.counts) for point in points] == [1] * 3 + [12] * 15
+    for point in points:
+        converged, bounded, diverged, undecided = point.counts
+        assert (point.stable, point.decided) == (converged, converged + bounded + diverged)
+        assert point.decided + undecided == sum(point.counts)
+        assert point.doubtful == (0 < converged < point.decided)
+        assert point.interval == wilson_interval(converged, converged + bounded + diverged)
 
 
 def test_random_cells_have_rows_of_shares(points: list[GridPoint], tmp_path: Path) -> None:
     with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
         lines = list(csv.DictReader(stream))
-    for line, place in zip(lines, points, strict=True):
+    for line, point in zip(lines, points, strict=True):
         row = {
             name: float(text) if text and name != "law" else None for name, text in line.items()
         }
-        assert tuple(row[verdict.value] for verdict in CellClass) == place.counts
-        assert (row["link.loss"], row["link.delay_ms"]) == place.values
-        assert (row["stable_share_low"], row["stable_share_high"]) == place.interval
-        if place.decided:
+        assert tuple(row[verdict.value] for verdict in CellClass) == point.counts
+        assert (row["link.loss"], row["link.delay_ms"]) == point.values
+        assert (row["stable_share_low"], row["stable_share_high"]) == point.interval
+        if point.decided:
             assert row["stable_share_low"] <= row["stable_share"] <= row["stable_share_high"]
         else:
             assert row["stable_share"] is None

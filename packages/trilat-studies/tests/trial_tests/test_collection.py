@@ -85,9 +85,9 @@ def test_figures_follow_their_definitions() -> None:
     assert figures.end_error_rad == max(e[end].max() for e in errors.values())
     assert figures.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
     assert figures.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
-    apart = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
-    assert 0.0 < max(apart) < 2.4
-    assert figures.synchronised_at_s == max(apart)
+    times_s = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
+    assert 0.0 < max(times_s) < 2.4
+    assert figures.synchronised_at_s == max(times_s)
     assert figures.ages["m1->s"].mean_ms == figures.ages["m1->s"].max_ms == 20.0
     assert (figures.late_samples, figures.missing, figures.end.diverged_at_s) == (0, 0, None)
 
@@ -184,8 +184,8 @@ def test_site_statistics_count_all_records(seed: int) -> None:
     assert tally.rms_error_rad == pytest.approx(
         max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1))
     )
-    apart = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
-    assert tally.unsynchronised_ns == (apart[-1] if apart else -1)
+    times_ns = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
+    assert tally.unsynchronised_ns == (times_ns[-1] if times_ns else -1)
     assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
     ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
     assert tally.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
@@ -291,7 +291,7 @@ def test_incomplete_windows_have_no_numbers(to_s: float, known: bool) -> None:
 
 def test_window_quantities_follow_their_definitions(log: Log) -> None:
     """The wall's force is the force whose torque J' F stands in the records."""
-    (found,) = measure_log(log).windows
+    (window,) = measure_log(log).windows
     site = log["s"]
     inside = (site.t_s >= 0.5) & (site.t_s < 1.5)
     force = np.zeros(len(site))
@@ -311,9 +311,9 @@ def test_window_quantities_follow_their_definitions(log: Log) -> None:
         "wall_hits": np.sum((force[1:] > 1e-9) & (force[:-1] <= 1e-9)),
     }
     assert wanted["wall_hits"] >= 1
-    assert {key: found[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
+    assert {key: window[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
     for joint, key in enumerate(("q1_rad", "q2_rad")):
-        assert found[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
+        assert window[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
 
 
 def test_runs_and_their_logs_have_equal_windows(log: Log) -> None:
@@ -330,12 +330,12 @@ def test_a_window_of_all_sites_has_the_largest(log: Log) -> None:
         "error_peak_rad": [0.0, 1.0],
         "torque_peak_nm": [0.0, 1.0],
     }
-    (found,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
+    (window,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
     inside = {name: (log[name].t_s >= 0.5) & (log[name].t_s < 1.5) for name in log.sites}
-    assert found["error_peak_rad"].most == max(
+    assert window["error_peak_rad"].most == max(
         np.abs(log[n].e[k]).max() for n, k in inside.items()
     )
-    assert found["torque_peak_nm"].least == max(
+    assert window["torque_peak_nm"].least == max(
         np.abs(log[n].tau[k]).max() for n, k in inside.items()
     )
 
@@ -355,19 +355,19 @@ def test_a_run_that_ended_before_has_no_window() -> None:
     ids=["plain", "random", "rates", "diverged"],
 )
 def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> None:
-    asked = scenario(**changes)
-    ticked: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
-    looped: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
+    varied = scenario(**changes)
+    ticked: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
+    looped: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
     diverged_at_s, _ = run_in_batches(
-        asked, {name: taken.append for name, taken in ticked.items()}
+        varied, {name: taken.append for name, taken in ticked.items()}
     )
     assert (
         run_compiled_in_batches(
-            asked, {n: taken.append for n, taken in looped.items()}
+            varied, {n: taken.append for n, taken in looped.items()}
         ).diverged_s
         == diverged_at_s
     )
-    for name in asked.names:
+    for name in varied.names:
         one, other = join_batches(ticked[name]), join_batches(looped[name])
         for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
@@ -377,23 +377,23 @@ def test_any_metric_may_be_expected() -> None:
     """The metric equals that of `trilat compare` on the whole run; a metric without number does
     not hold, and the reason is given.
     """
-    asked = {
+    expectations = {
         "chatter_nm": [0.0, 1e-9],
         "rms_error_rad": [0.0, 10.0],
         "theta_error_last": [0.0, 1.0],
     }
-    scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": asked}})
+    scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": expectations}})
     log = trilat_net.simulate(scenario)
     compared = trilat_net.compare(log, log).metrics
     run, logged = measure_virtual_run(scenario), measure_log(log)
     assert run.metrics == logged.metrics
-    found = {
+    outcomes = {
         expectation.key: expectation
         for expectation in evaluate_expectations(scenario.expect, run)
     }
-    assert [found[f"metrics.{key}"].held for key in asked] == [False, True, False]
-    assert found["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
-    assert "nothing is learnt" in found["metrics.theta_error_last"].measured
+    assert [outcomes[f"metrics.{key}"].held for key in expectations] == [False, True, False]
+    assert outcomes["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
+    assert "nothing is learnt" in outcomes["metrics.theta_error_last"].measured
 
 
 @pytest.mark.parametrize(

@@ -178,10 +178,10 @@ def test_a_failure_carries_the_figures_and_the_command() -> None:
 def test_properties_say_what_was_run() -> None:
     suite = document(mixed()).find("testsuite")
     assert suite is not None
-    found = {p.get("name"): p.get("value") for p in suite.iter("property")}
-    assert found["driver"] == "virtual"
-    assert found["random"] == "true"
-    assert found["simulated_s"] == "60"
+    properties = {p.get("name"): p.get("value") for p in suite.iter("property")}
+    assert properties["driver"] == "virtual"
+    assert properties["random"] == "true"
+    assert properties["simulated_s"] == "60"
 
 
 @given(text=st.text())

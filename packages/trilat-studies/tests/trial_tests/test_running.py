@@ -27,10 +27,10 @@ def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], 
 @pytest.mark.long
 def test_two_processes_give_equal_results_in_order() -> None:
     batch = trilat_net.trials(quick(), [5, 2, 9, 4])
-    told: list[TrialResult] = []
-    report = run_trials(batch, 2, told.append)
+    results: list[TrialResult] = []
+    report = run_trials(batch, 2, results.append)
     assert facts(report.results) == facts(run_trials(batch, 1).results)
-    assert sorted(facts(told)) == sorted(facts(report.results))
+    assert sorted(facts(results)) == sorted(facts(report.results))
     assert report.held
     assert report.wall_s > 0.0
 

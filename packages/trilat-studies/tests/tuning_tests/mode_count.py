@@ -39,14 +39,14 @@ def count_growing(M: Array, K: Array, d: Array, delay_ticks: int, h_s: float) ->
         return np.linalg.det(one - np.array([1.0, -1.0]).reshape(2, 1, 1) * G[:, np.newaxis])
 
     angle = np.geomspace(1e-3 * _GROWTH, np.pi, 500)
-    found = values(angle)
+    determinants = values(angle)
     while True:
-        turns = np.angle(found[1:] / found[:-1])
+        turns = np.angle(determinants[1:] / determinants[:-1])
         wide = np.flatnonzero(np.abs(turns).max(axis=1) > 0.8)
         if not len(wide):
             break
         between = np.sqrt(angle[wide] * angle[wide + 1])
-        found = np.insert(found, wide + 1, values(between), axis=0)
+        determinants = np.insert(determinants, wide + 1, values(between), axis=0)
         angle = np.insert(angle, wide + 1, between)
     alone = int((np.abs(np.linalg.eigvals(P)) > 1.0 + _GROWTH).sum())
     return 2 * alone - round(float(turns.sum()) / np.pi)

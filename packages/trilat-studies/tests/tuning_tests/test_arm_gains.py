@@ -155,9 +155,9 @@ def tune_shoulder(share: float) -> ArmGains:
 @settings(max_examples=3)
 @given(st.floats(0.05, 20.0))
 def test_gains_scale_with_all_masses(c: float) -> None:
-    found = [tune_shoulder(1.0), tune_shoulder(c)]
+    arms = [tune_shoulder(1.0), tune_shoulder(c)]
     for name in ("K", "d"):
-        assert gains(found[1], name) == pytest.approx(c * gains(found[0], name), rel=5e-3)
+        assert gains(arms[1], name) == pytest.approx(c * gains(arms[0], name), rel=5e-3)
 
 
 def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
@@ -237,8 +237,8 @@ def test_sessions_have_the_delay_of_their_slowest_link(
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
     monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
-    words = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
-    facts = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    arguments = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
+    facts = json.loads(trilat(*arguments, cwd=tmp_path).succeeds())
     assert facts["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
 
 
@@ -250,11 +250,11 @@ def test_laws_with_stiffness_are_tuned_at_three_sites(law: str, tmp_path: Path) 
 
 @pytest.mark.long
 def test_gains_of_several_joints_scale_with_all_masses() -> None:
-    heavy = [one._replace(mass=7.0 * one.mass) for one in (SHOULDER, ELBOW)]
+    heavy = [piece._replace(mass=7.0 * piece.mass) for piece in (SHOULDER, ELBOW)]
     texts = [write_arm(arm) for arm in ([SHOULDER, ELBOW], heavy)]
-    found = [tune_arm("arm", "30ms", set={"urdf": {"arm": text}}) for text in texts]
+    arms = [tune_arm("arm", "30ms", set={"urdf": {"arm": text}}) for text in texts]
     for name in ("K", "d"):
-        assert gains(found[1], name) == pytest.approx(7.0 * gains(found[0], name), rel=5e-3)
+        assert gains(arms[1], name) == pytest.approx(7.0 * gains(arms[0], name), rel=5e-3)
 
 
 def test_a_digital_controller_tolerates_less_gain(one_joint: Path) -> None:
@@ -274,8 +274,8 @@ dominance = {{ m = {{ s = 1.0 }}, s = {{ m = 1.0 }} }}
 
 
 def test_the_printed_line_fits_a_scenario(one_joint: Path, tmp_path: Path) -> None:
-    words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
-    facts = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    arguments = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
+    facts = json.loads(trilat(*arguments, cwd=tmp_path).succeeds())
     (tmp_path / "mine.toml").write_text(SCENARIO.format(line=facts["line"]), encoding="utf-8")
     control = tn.load_scenario(tmp_path / "mine.toml").sites["m"].control
     assert list(control.K) == [joint["K"] for joint in facts["joints"]]
@@ -283,8 +283,8 @@ def test_the_printed_line_fits_a_scenario(one_joint: Path, tmp_path: Path) -> No
 
 
 def test_the_command_draws_and_prints(one_joint: Path, tmp_path: Path) -> None:
-    words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--figure", "gains.png")
-    output = trilat(*words, cwd=tmp_path).succeeds()
+    arguments = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--figure", "gains.png")
+    output = trilat(*arguments, cwd=tmp_path).succeeds()
     assert "effort limit" in output
     assert re.search(r"ok +run of .* at 0.95 of the edge: decays", output)
     assert re.search(r"ok +run of .* at 1.1 of the edge: grows", output)
@@ -319,10 +319,10 @@ def test_bad_input_is_refused_with_the_valid_choices(
 ) -> None:
     more, fact = REFUSED[kind]
     (tmp_path / "empty.csv").write_text("t_s,delay_ms\n", encoding="utf-8")
-    words = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
-    trilat("tune", *(word for pair in words.items() for word in pair), cwd=tmp_path).refuses(
-        fact
-    )
+    arguments = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
+    trilat(
+        "tune", *(word for pair in arguments.items() for word in pair), cwd=tmp_path
+    ).refuses(fact)
 
 
 def test_python_names_its_arguments(one_joint: Path) -> None:

@@ -32,11 +32,11 @@ def push(user_nm: float = 0.0, slave_nm: float = 0.0) -> Array:
 
 def test_mass_on_a_spring_has_closed_form_motion() -> None:
     """M qdd + B qd + K q = F: F / K (1 - exp(-s t) (cos(w t) + s / w sin(w t)))."""
-    found = move_impedance(MASTER, np.full((len(T_S), 1), 3.0), H_S)[:, 0]
+    motion = move_impedance(MASTER, np.full((len(T_S), 1), 3.0), H_S)[:, 0]
     decay = 10.0 / 4.0
     omega = np.sqrt(50.0 / 2.0 - decay**2)
     swing = np.cos(omega * T_S) + decay / omega * np.sin(omega * T_S)
-    assert found == pytest.approx(3.0 / 50.0 * (1.0 - np.exp(-decay * T_S) * swing), abs=1e-10)
+    assert motion == pytest.approx(3.0 / 50.0 * (1.0 - np.exp(-decay * T_S) * swing), abs=1e-10)
 
 
 def test_impedance_target_rests_as_documented() -> None:

@@ -38,29 +38,29 @@ def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> N
         return
     scheme = ["scheme=digital"] if law in HELD else []
     experiment = load_tuning_scenario(scenario, ["limits.tau_limit_nm=60", *scheme])
-    found = experiment.with_gains(
+    candidate = experiment.with_gains(
         SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]
     ).scenario
-    for name, site in found.sites.items():
+    for name, site in candidate.sites.items():
         assert site.control.__struct_config__.tag == ("adaptive" if law == "known" else law)
         assert site.limits == experiment.scenario.sites[name].limits
         assert site.limits.tau_limit_nm == 60.0
         if site.control.plugged:
             assert getattr(site.control, "gravity", 0.95) == 0.95
             continue
-        known = site.control.gains(found.arms[name].theta)
+        known = site.control.gains(candidate.arms[name].theta)
         first = known.known if np.any(known.known) else known.theta_hat0
-        assert first[3:] == pytest.approx(0.95 * found.arms[name].theta[3:])
-    with_same_control = {name: site.control for name, site in found.sites.items()}
-    assert found.links == experiment.scenario.links
+        assert first[3:] == pytest.approx(0.95 * candidate.arms[name].theta[3:])
+    with_same_control = {name: site.control for name, site in candidate.sites.items()}
+    assert candidate.links == experiment.scenario.links
     assert len(with_same_control) == len(experiment.scenario.names)
 
 
 def test_sites_with_own_control_are_changed_separately() -> None:
-    found: TuningScenario = load_tuning_scenario("contact").with_gains(
+    candidate: TuningScenario = load_tuning_scenario("contact").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
-    assert [text.partition("=")[0] for text in found.overrides] == [
+    assert [text.partition("=")[0] for text in candidate.overrides] == [
         "sites.m.control",
         "sites.s.control",
     ]
@@ -81,7 +81,7 @@ def test_equal_quantities_have_equal_ranges_in_laws() -> None:
             ranges.setdefault(knob.name.partition("_")[0], set()).add(
                 (knob.unit, knob.low, knob.high)
             )
-    assert all(len(found) == 1 for found in ranges.values())
+    assert all(len(bounds) == 1 for bounds in ranges.values())
     assert ranges["d"] == {("N m s/rad", *next(iter(ranges["Kp"]))[1:])}
 
 
@@ -90,7 +90,7 @@ def six(state: ChainState, **overrides: object) -> TuningScenario:
     start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
     given = {"arm.stops": False, **start, **overrides}
     return load_tuning_scenario(
-        "six_joints", [f"{key}={format_toml_value(one)}" for key, one in given.items()]
+        "six_joints", [f"{key}={format_toml_value(value)}" for key, value in given.items()]
     )
 
 
@@ -101,12 +101,12 @@ def test_joints_share_gains_by_inertia_from_pinocchio() -> None:
         weights = weigh_joints(six(state).scenario)
         assert weights == pytest.approx(inertia / inertia.max(), rel=0.05)  # two digits
         gains = {"Lambda": 2.0, "Kp": 30.0, "Kd": 4.0, "Gamma": 0.5}
-        found = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
-        control = found.scenario.sites["m1"].control
+        candidate = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
+        control = candidate.scenario.sites["m1"].control
         assert control.Kp == pytest.approx(30.0 * np.array(weights))
         assert control.Kd == pytest.approx(4.0 * np.array(weights))
         assert control.Lambda == (2.0,) * 6
-        assert sum("control=" in text for text in found.overrides) == 1  # one for all sites
+        assert sum("control=" in text for text in candidate.overrides) == 1  # one for all sites
     assert weigh_joints(load_scenario("free")) == []
 
 

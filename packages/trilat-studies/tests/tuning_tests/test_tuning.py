@@ -37,14 +37,16 @@ def test_the_number_of_processes_changes_no_result(
     tuning_result: TuningResult, tmp_path: Path
 ) -> None:
     again = plan_quick_tuning(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
-    assert [one.tried for one in again.found] == [one.tried for one in tuning_result.found]
-    assert [one.scores for one in again.found] == [one.scores for one in tuning_result.found]
-    assert [one.score for one in again.printed] == [one.score for one in tuning_result.printed]
+    assert [law.tried for law in again.found] == [law.tried for law in tuning_result.found]
+    assert [law.scores for law in again.found] == [law.scores for law in tuning_result.found]
+    assert [candidate.score for candidate in again.printed] == [
+        candidate.score for candidate in tuning_result.printed
+    ]
 
 
 def test_laws_use_their_budget_and_runs_end_once(tuning_result: TuningResult) -> None:
-    for one in tuning_result.found:
-        assert len(one.tried) == len(one.scores) == sum(one.outcomes.values()) == 6
+    for law in tuning_result.found:
+        assert len(law.tried) == len(law.scores) == sum(law.outcomes.values()) == 6
 
 
 def test_candidates_differ_only_in_their_law(tuning_result: TuningResult) -> None:
@@ -82,48 +84,50 @@ def test_a_front_is_dominated_by_no_law(tuning_result: TuningResult) -> None:
 
 
 def test_the_command_of_a_point_repeats_its_run(tuning_result: TuningResult) -> None:
-    for one in tuning_result.found:
-        for place in one.front:
-            arguments = shlex.split(tuning_result.candidate(one, place).command)
+    for law in tuning_result.found:
+        for place in law.front:
+            arguments = shlex.split(tuning_result.candidate(law, place).command)
             assert arguments[:2] == ["trilat", "sim"]
             assert arguments[3::2] == ["--set"] * (len(arguments[3:]) // 2)
             assert (
                 measure_candidate(load_scenario(arguments[2], arguments[4::2]).text, None)
-                == one.scores[place]
+                == law.scores[place]
             )
 
 
 def test_printed_gains_are_measured_and_never_searched(tuning_result: TuningResult) -> None:
-    told, untold = tuning_result.printed
-    assert [told.name, untold.name] == ["as printed", "as printed, told nothing"]
-    controls = [one.candidate.scenario.sites["s"].control.gains(None) for one in (told, untold)]  # type: ignore[arg-type]
+    informed, untold = tuning_result.printed
+    assert [informed.name, untold.name] == ["as printed", "as printed, told nothing"]
+    controls = [
+        one.candidate.scenario.sites["s"].control.gains(None) for one in (informed, untold)
+    ]  # type: ignore[arg-type]
     assert [tuple(c.Lambda) for c in controls] == [(1.0, 1.0)] * 2
     assert [tuple(c.theta_hat0) for c in controls] == [(0.0, 0.0, 0.0, 2.0, 1.0), (0.0,) * 5]
-    every = {tuple(gains.values()) for one in tuning_result.found for gains in one.tried}
-    assert (1.0, 1.0, 3.0, 1.0) not in every
+    tried_gains = {tuple(gains.values()) for one in tuning_result.found for gains in one.tried}
+    assert (1.0, 1.0, 3.0, 1.0) not in tried_gains
 
 
 def test_failed_runs_are_in_facts_and_counted(tmp_path: Path) -> None:
     """No run keeps the speed limit: the front is empty, and the result says so."""
-    found = plan_quick_tuning(
+    result = plan_quick_tuning(
         tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4
     ).run(jobs=1)
-    law = found.to_dict()["laws"]["p_d"]
+    law = result.to_dict()["laws"]["p_d"]
     assert law["outcomes"] == {
         word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass
     }
     assert law["front"] == []
     assert [candidate["outcome"] for candidate in law["candidates"]] == ["diverged"] * 4
-    assert found.list_edge_gains(found.found[0]) == []
+    assert result.list_edge_gains(result.found[0]) == []
 
 
 def test_hanging_arms_never_reach_a_real_front(tmp_path: Path) -> None:
     """The laws are given half of gravity: a law that does not learn cannot stand, some that learn can."""
     settings = ("duration_s=10.0", "control.Kd=1")
-    found = plan_quick_tuning(
+    result = plan_quick_tuning(
         tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0
     ).run(jobs=1)
-    learns, knows = found.found
+    learns, knows = result.found
     assert knows.front == []
     assert knows.outcomes[CandidateClass.STRAYED] >= 1
     assert knows.outcomes[CandidateClass.SETTLED] == 0
@@ -173,8 +177,8 @@ def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearc
     search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
     outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
     scores = [
-        CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
-        for n, one in enumerate(outcomes, 1)
+        CandidateScore(outcome, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
+        for n, outcome in enumerate(outcomes, 1)
     ]
     search.record_scores([gains] * 6, scores)
     return search
@@ -245,8 +249,8 @@ def test_the_table_of_laws_counts_every_run(tuning_result: TuningResult) -> None
 
 def test_long_fronts_are_shortened_between_both_ends(tuning_result: TuningResult) -> None:
     one = with_front("adaptive", tuning_result.found[0].tried[0], 5)
-    shown = [row[0].rstrip("*") for row in tabulate_front(tuning_result, one, 3).rows]
-    assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
+    shown_places = [row[0].rstrip("*") for row in tabulate_front(tuning_result, one, 3).rows]
+    assert shown_places == ["adaptive 1", "adaptive 3", "adaptive 5"]
     assert len(tabulate_front(tuning_result, one).rows) == 5
     assert (
         tabulate_front(
