@@ -230,11 +230,12 @@ def test_rates_are_reported_with_their_lateness(
 ) -> None:
     done = SimpleNamespace(returncode=0, stdout=json.dumps(rates))
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
-    findings = doctor.examine_rate()
-    assert findings.state == state
-    assert text in findings.text
+    finding = doctor.examine_rate()
+    assert finding.state == state
+    assert text in finding.text
 
 
+@pytest.mark.push
 def test_real_loops_are_measured_in_own_processes() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 
@@ -246,9 +247,9 @@ def test_promised_findings_are_reported(
     kernel: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "system", lambda: kernel)
-    findings = doctor.examine_system()
-    assert findings.state == ("warn" if name else "ok")
-    assert name in findings.text
+    finding = doctor.examine_system()
+    assert finding.state == ("warn" if name else "ok")
+    assert name in finding.text
 
 
 def test_open_rights_are_no_finding_on_windows(

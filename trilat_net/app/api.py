@@ -67,7 +67,7 @@ def simulate(
         ScenarioError: The scenario or an override is not valid.
     """
     log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
-    log.warn_if_diverged()
+    log.warn_of_failures()
     return log
 
 

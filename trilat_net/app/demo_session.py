@@ -730,5 +730,5 @@ def run(
         kept = f"; {result.log} holds what there was" if result.log.exists() else ""
         raise RunFailed("; ".join(problems) + kept)
     log = open_log(result.log)
-    log.warn_if_diverged()
+    log.warn_of_failures()
     return log

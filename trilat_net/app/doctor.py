@@ -637,8 +637,9 @@ def is_held(rate_hz: int, late_us: int) -> bool:
 
 
 _RATES_CODE = (
-    "import json; from sites import doctor, realtime; realtime.prepare(None); "
-    "print(json.dumps(doctor.rehearse_rates(doctor.SystemClock())))"
+    f"import json; from {__name__} import SystemClock, rehearse_rates; "
+    "from sites.realtime import prepare; prepare(None); "
+    "print(json.dumps(rehearse_rates(SystemClock())))"
 )
 """Program that requests the real-time settings of a site, and prints the result of the trials.
 """

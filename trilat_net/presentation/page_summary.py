@@ -19,7 +19,9 @@ import numpy as np
 from markupsafe import Markup
 
 from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.metrics.motion_metrics import measure_undelayed_error
 from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
+from ..analysis.run_view import RunView
 from ..analysis.site_signals import (
     SETTLED_ERROR_RAD,
     JointError,
@@ -158,6 +160,8 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     has_converged = end.behaviour is EndBehaviour.CONVERGED
     if has_converged and remains:
         clause = "the arms were at rest, with errors that stay"
+    elif is_stable and end.behaviour is EndBehaviour.UNDECIDED:
+        clause = "the motion showed no trend yet, which the evidence above does not need"
     else:
         clause = _ENDS[end.behaviour]
     text = f"At the end of the record, {clause}."
@@ -249,7 +253,8 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
     masters = [site for site in log.sites if site not in slaves]
     cards = []
     if slaves:
-        cards.append(_describe_errors(log, slaves, "from where the masters lead"))
+        card = _describe_errors(log, slaves, "from where the masters lead")
+        cards.append(card._replace(detail=card.detail + _describe_undelayed_error(log, slaves)))
     if masters:
         cards.append(_describe_errors(log, masters, "from the others"))
     return cards
@@ -278,6 +283,30 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
         if last.site in _list_pushed_sites(log):
             detail += ", which a hand or a wall still pushes"
     return _KeyNumber(f"{join_words(sites)} {place}", f"{peak.value:.3g} {unit}", detail)
+
+
+def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> str:
+    """Returns the largest distance of the slaves from where the others were at the same time.
+
+    The error compares a slave with what its peers sent some time ago. A reader who sees the
+    arms apart on the screen looks for the distance at the same time.
+
+    Args:
+        log: Log of the run.
+        slaves: Names of the slaves.
+
+    Returns:
+        A sentence that follows other text. Empty if the distance is unknown.
+    """
+    view = RunView(log)
+    unit = "rad" if shared_unit(log) == "rad" else "m"
+    errors = [
+        measure_undelayed_error(view, slave)[f"undelayed_max_{unit}"].value for slave in slaves
+    ]
+    known = [error for error in errors if error is not None]
+    if not known:
+        return ""
+    return f"; {max(known):.3g} {unit} at the same moment"
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:

@@ -114,6 +114,7 @@ def list_moments(log: Log, facts: JsonObject) -> list[RunMoment]:
         *_list_changes(log, facts),
         *_list_pushes(log),
         *_list_modes(log),
+        *_list_hands(log),
         *_list_errors(log, facts),
         RunMoment(recorded_end_s(log), "The record ends."),
     ]
@@ -134,6 +135,18 @@ def describe_dominance(scenario: Scenario) -> str:
         followed = [f"{peer} {share:g}" for peer, share in shares.items() if share]
         sentences.append(f"{site} follows {', '.join(followed) or 'nobody'}")
     return "; ".join(sentences)
+
+
+def _list_hands(log: Log) -> Iterator[RunMoment]:
+    """Yields when people and programs took hold of arms or let go, and which ones failed."""
+    for event in log.events:
+        if event.kind == "hand":
+            yield RunMoment(
+                max(event.t_ns, 0) * 1e-9,
+                f"{event.text}.",
+                event.member,
+                is_bad=event.text in log.failed_hands,
+            )
 
 
 def _list_changes(log: Log, facts: JsonObject) -> Iterator[RunMoment]:

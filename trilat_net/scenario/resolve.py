@@ -996,6 +996,18 @@ def _complete_link(
     return link
 
 
+def _list_link_paths(written: TomlTable, path: str) -> list[str]:
+    """Returns the paths that the author of the common settings of links may have meant.
+
+    The settings of one link stand in the table `links`, those of all links in the table `link`.
+
+    Args:
+        written: Settings as the author wrote them.
+        path: Path of the settings.
+    """
+    return [f"links.{key}" for key in written if path == "link" and "->" in key]
+
+
 def _resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     """Completes the settings of a link with defaults.
 
@@ -1037,7 +1049,7 @@ def _resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     model_keys = {name: field_names(kind) for name, kind in DELAY_MODELS.items()}
     model_keys["trace"] = (*model_keys["trace"], *TRACE_KEYS)
     _check_kind_keys(written, valid_keys, path, f"model {model}", model_keys)
-    local_table = check_keys(written, valid_keys, path)
+    local_table = check_keys(written, valid_keys, path, _list_link_paths(written, path))
 
     # Delays that are written out replace the file of the defaults, and a file replaces delays.
     replaced_keys: tuple[str, ...] = ()

@@ -30,7 +30,7 @@ from ...results import JsonObject
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
-from ..aligned import AlignedRecords, Bools, find_common_rows
+from ..aligned import AlignedRecords, Bools, PeerTrajectory, find_common_rows
 from ..arm_rows import (
     ArmRows,
     PlanarArmRows,
@@ -50,6 +50,7 @@ from .measures import (
     NETWORK,
     SPREAD,
     TRACKING,
+    UNDELAYED,
     Metric,
     MetricValues,
     Quantity,
@@ -65,12 +66,17 @@ from .measures import (
 LONG_END_S = 5.0
 """Length of the end of a run in which contact and slopes of estimates are measured, in s."""
 _ERRORS = {"rms_error": "RMS e", "max_error": "peak |e|", "max_error_end": "peak |e|, last 1 s"}
+_UNDELAYED_ERRORS = {
+    "undelayed_rms": "RMS of {0} from where the peers are then",
+    "undelayed_max": "largest distance of {0} from where the peers are then",
+    "undelayed_end": "largest distance of {0} from where the peers are then, last 1 s",
+}
 _SPREADS = {
     "spread_rms": "RMS spread, undelayed",
     "spread_max": "largest spread",
     "spread_end": "largest spread, last 1 s",
 }
-_LAGS = {
+_DELAYED_DISTANCES = {
     "following_rms": "RMS {0}_m(t-T) - {0}_s",
     "following_max": "peak |{0}_m(t-T) - {0}_s|",
     "following_end": "peak |{0}_m(t-T) - {0}_s|, last 1 s",
@@ -112,6 +118,73 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
         site_signals.settling_time_s(part), f"|e| exceeds {limit} in the last record"
     )
     return metrics
+
+
+@measures("site", UNDELAYED, *list_shared_quantities(_UNDELAYED_ERRORS))
+def measure_undelayed_error(view: RunView, site: str) -> MetricValues:
+    """Measures how far a site is from where its peers are at the same time.
+
+    The error e of a site compares its coordinates with what its peers sent some time ago. The
+    undelayed error compares them with the peers' coordinates at the same time t, weighted by
+    the dominance factors:
+
+        q_i(t) - sum_j alpha_ij(t) q_j(t)
+
+    It therefore includes what the delay costs. Between the ticks of a peer its motion is
+    interpolated.
+
+    Args:
+        view: The run.
+        site: Name of the site.
+    """
+    log = view.log
+    followed = _list_followed_peers(view, site)
+    missing = [name for name in (site, *followed) if name not in view.sites]
+    if missing:
+        return unavailable(UNDELAYED, f"no records of {', '.join(missing)}")
+    if not followed:
+        return unavailable(UNDELAYED, f"{site} follows nobody", applies=False)
+
+    run = view.sites[site]
+    records = run.records
+    t_s = records.t_s
+    known = records.known.copy()
+    mean = np.zeros_like(records.shared)
+    for peer, alpha in followed.items():
+        peer_records = view.sites[peer].records
+        motion = PeerTrajectory(peer_records).evaluate(t_s)
+        known &= motion.known & (t_s <= peer_records.t_s[-1])
+        positions = motion.q
+        if records.x.shape[1] == POSE:
+            orientations = choose_nearest_vectors(
+                positions[:, POSITION:], records.x[:, POSITION:]
+            )
+            positions[:, POSITION:] = orientations
+        mean += alpha[:, np.newaxis] * positions
+    if not known.any():
+        return unavailable(UNDELAYED, "no instant of which every site has a record")
+
+    if records.x.size:
+        error = compute_task_errors(records.x, mean, records.axes)
+    else:
+        error = records.q - mean
+    return measure_shared(
+        group=UNDELAYED,
+        space=log.scenario.sites[site].task.space,
+        keys=_UNDELAYED_ERRORS,
+        differences=error[known],
+        at_end=records.known_at_end(END_WINDOW_S)[known],
+        why_not_at_end="in the last second there is no time at which every site has a record",
+    )
+
+
+def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
+    """Returns the dominance factors of the followed peers over time, shape (K,) each."""
+    if site not in view.sites:
+        return {}
+    alpha = view.sites[site].dominance.alpha
+    peers = view.scenario.peers(site)
+    return {peer: alpha[:, n] for n, peer in enumerate(peers) if alpha[:, n].any()}
 
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
@@ -160,7 +233,7 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     )
 
 
-@measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
+@measures("link", FOLLOWING, *list_shared_quantities(_DELAYED_DISTANCES))
 def measure_following(view: RunView, link: str) -> MetricValues:
     """Measures how far a slave is from the delayed motion of its master.
 
@@ -200,7 +273,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     return measure_shared(
         group=FOLLOWING,
         space=specs[site].task.space,
-        keys=_LAGS,
+        keys=_DELAYED_DISTANCES,
         differences=lag[known],
         at_end=slave.known_at_end(END_WINDOW_S)[known],
         why_not_at_end="no sample in the last second",

@@ -673,7 +673,7 @@ def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
             "the loop has no equilibrium near the end of the run "
-            f"(residual {rest.residual:.2g} rad/s^2); give a pose, as in --pose 0.1,0.3",
+            f"(residual {rest.residual:.2g} rad/s^2); `trilat linear --pose 0.1,0.3` takes one",
             source=scenario.name,
         )
     return rest

@@ -32,7 +32,7 @@ import numpy as np
 from ...core.links.philox import link_key
 from ...core.step.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.step.vectors import Array
-from ...errors import ScenarioError
+from ...errors import ScenarioError, join_words
 from ...execution.fused import FusedRun
 from ...execution.virtual import simulate_scenario
 from ...log.log_reader import Log
@@ -43,6 +43,7 @@ from ...scenario.delay_models.kernel_delays import ConstantDelay
 from ...scenario.delay_period import find_final_link, is_ending_trace
 from ...scenario.imported_code import ImportedLaw
 from ...scenario.sample_uses import draw_used_samples
+from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
 from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s
@@ -83,6 +84,8 @@ class EndLoop(NamedTuple):
             the rest, in rad.
         last_pose: The last pose of the run. None if it is the rest. Arms that nobody holds may
             rest anywhere in between.
+        programs: Sites whose arms a program of the user moves. How it reacts to the arms is not
+            part of the linearised loop.
     """
 
     scenario: Scenario
@@ -92,6 +95,7 @@ class EndLoop(NamedTuple):
     has_mean_ages: bool
     distance_rad: float
     last_pose: Equilibrium | None = None
+    programs: tuple[str, ...] = ()
 
     def compute_sampled_roots(self, count: int) -> Spectrum | None:
         """Computes the rightmost roots of the loop with its ticks.
@@ -179,7 +183,8 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
     if state is None:
         theta_hat = [site_log.theta_hat[-1] for site_log in site_logs]
         state = _choose_end_state(final.scenario, trace, theta_hat)
-    return _build_end_loop(final, state, trace, own_laws=own_laws)
+    loop = _build_end_loop(final, state, trace, own_laws=own_laws)
+    return loop._replace(programs=tuple(list_program_sites(log)))
 
 
 def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
@@ -228,7 +233,9 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
             columns = ended.layout(name).columns()
             theta_hat.append(record[columns["theta_hat"]])
         state = _choose_end_state(ended, trace, theta_hat)
-    return _build_end_loop(final, state, trace, own_laws=True)
+    loop = _build_end_loop(final, state, trace, own_laws=True)
+    programs = [site for site in scenario.names if has_program_hand(scenario, site)]
+    return loop._replace(programs=tuple(programs))
 
 
 def resolve_final_scenario(log: Log) -> Scenario:
@@ -329,13 +336,31 @@ def _compute_roots(loop: EndLoop) -> LoopRoots:
             # The arms still move, and it is not known where in between they will rest.
             last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
             exact = _has_same_sign(sampled, last_roots)
+        # A program that reacts to the arms may make a loop unstable, or stable.
+        exact = exact and not loop.programs
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
-        return roots._replace(distance_rad=loop.distance_rad)
+        return roots._replace(
+            distance_rad=loop.distance_rad, leaves_out=_name_left_out(loop.programs)
+        )
     continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
     basis = ", in continuous time"
     if loop.conditions.varying or loop.has_mean_ages:
         basis += ", of the mean ages"
-    return _describe_roots(continuous, basis, exact=False)
+    roots = _describe_roots(continuous, basis, exact=False)
+    return roots._replace(leaves_out=_name_left_out(loop.programs))
+
+
+def _name_left_out(programs: Sequence[str]) -> str:
+    """Returns which reactions the linearised loop leaves out, as a phrase. Empty if none.
+
+    Args:
+        programs: Sites whose arms a program of the user moves.
+    """
+    if not programs:
+        return ""
+    if len(programs) == 1:
+        return f"how the program at {programs[0]} reacts to the arms"
+    return f"how the programs at {join_words(programs)} react to the arms"
 
 
 def _has_same_sign(at_rest: Spectrum, at_last_pose: Spectrum | None) -> bool:

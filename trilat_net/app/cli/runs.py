@@ -92,6 +92,8 @@ def sim_command(
         report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(files))}"
         terminal.print_text(f"next: {report}")
 
+    for failure in open_log(path).failed_hands:
+        terminal.print_note(failure)
     if not stayed_in_limits:
         remedy = ""
         if any(spec.arm.urdf for spec in chosen.sites.values()):

@@ -46,6 +46,9 @@ PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "set
 POLICY = "policy"
 """Name by which a trained program takes hold of an arm, as the log mentions it."""
 
+FAILED_HAND = "failed at tick"
+"""Words by which the events of a log say that a program failed while it moved an arm."""
+
 
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
@@ -310,7 +313,7 @@ class HandPlayer:
             k: Number of the tick in which it lets go.
             problem: Reason of the failure, as a string for the user.
         """
-        self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
+        self.failure = f"{self._site}: its hand {self._code} {FAILED_HAND} {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
         self.hand.release(k)
 
