@@ -132,7 +132,9 @@ def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_its_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_example_of_a_docstring_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     text = inspect.getdoc(getattr(tn, name)) or ""
     example = doctest.DocTestParser().get_doctest(text, {"tn": tn}, name, None, None)

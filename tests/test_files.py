@@ -319,7 +319,7 @@ def test_extras_stand_between_commas_or_spaces(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "word"), [("", "which extras"), ("views", "there is no extra views")]
 )
-def test_a_wrong_extra_lists_what_there_is(text: str, word: str) -> None:
+def test_a_wrong_extra_lists_the_existing_ones(text: str, word: str) -> None:
     with pytest.raises(SystemExit, match=word) as error:
         parse_extras(text)
     for name in list_extras():

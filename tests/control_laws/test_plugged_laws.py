@@ -56,7 +56,7 @@ def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("law", LONG)
-def test_its_log_can_be_executed_again(law: str) -> None:
+def test_logs_of_plugged_laws_can_be_reexecuted(law: str) -> None:
     log = opened(recorded(LAWS[law][0], overrides(law)))
     verdict = verify(log)
     assert verdict.whole_run

@@ -51,7 +51,7 @@ def trajectory(scenario: str, overrides: dict[str, Any]) -> Run:
 
 
 @pytest.mark.long
-def test_it_holds_to_the_end_of_the_paper() -> None:
+def test_play_out_holds_throughout_the_paper() -> None:
     link = {"model": "gamma", "delay_ms": 60.0, "deviation_ms": 10.0, "playout_ms": BUDGET_MS}
     assert same_bits(trajectory("paper", {"link": link}), run("paper"))
 

@@ -224,7 +224,7 @@ def test_without_the_compiler_it_has_the_same_bits() -> None:
     assert plain == run_program(_PROGRAM, compiled=True)
 
 
-def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
+def test_unsupported_runs_are_refused() -> None:
     with pytest.raises(
         ScenarioError, match=r"sites\.m1\.plant: is external: .* can only run live"
     ):

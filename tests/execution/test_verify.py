@@ -101,7 +101,7 @@ def test_one_changed_vector_bit_is_named(
 
 @settings(max_examples=15)
 @given(site=st.sampled_from(SITES), tick=ticks, peer=st.integers(0, 1), bit=st.integers(0, 12))
-def test_one_bit_of_used_is_found_and_named(site: str, tick: int, peer: int, bit: int) -> None:
+def test_a_changed_bit_of_used_is_named(site: str, tick: int, peer: int, bit: int) -> None:
     name = [other for other in SITES if other != site][peer]
 
     def change(r: Record) -> None:
@@ -176,7 +176,7 @@ def test_fields_that_nothing_computes_from_are_compared_too(field: str) -> None:
         ('scheme = "second_order"', 'scheme = "digital"'),
     ],
 )
-def test_one_other_scenario_number_is_found(old: str, new: str) -> None:
+def test_another_scenario_number_is_found(old: str, new: str) -> None:
     def scenario(text: str) -> str:
         assert old in text
         return text.replace(old, new, 1)

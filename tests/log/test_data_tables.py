@@ -62,7 +62,7 @@ def test_column_names_are_unique_with_units(which: str) -> None:
         (True, "its one-way delay, by the offset of"),
     ],
 )
-def test_delays_of_arrivals_say_what_they_are(*, live: bool, said: str) -> None:
+def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:
     """In virtual time nothing is under way: a sample's delay there is no network's."""
     table = build_arrivals_table(paper()["m1"], "run.mcap", live=live)
     (delay,) = (one for one in table.columns if one.name == "delay_us")

@@ -35,7 +35,7 @@ PATTERNS = st.lists(
 
 
 @given(expression=PATTERNS, key=KEYS)
-def test_an_expression_matches_what_it_includes_for_zenoh(expression: str, key: str) -> None:
+def test_expressions_match_like_those_of_zenoh(expression: str, key: str) -> None:
     try:
         known = zenoh.KeyExpr(expression)
     except zenoh.ZError:  # another spelling of one that is known

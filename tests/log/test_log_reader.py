@@ -222,7 +222,7 @@ def test_cut_files_open_as_far_as_whole() -> None:
 @pytest.mark.parametrize(
     "data", [b"", b"no log at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + b"\0" * 99]
 )
-def test_what_is_no_mcap_file_is_refused(data: bytes, tmp_path: Path) -> None:
+def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(LogError):
         opened(data)
     path = tmp_path / "no.mcap"

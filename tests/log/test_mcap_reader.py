@@ -298,7 +298,7 @@ def test_an_attachment_whose_checksum_differs_is_damaged() -> None:
     assert items == ITEMS
 
 
-def test_progress_is_told_up_to_the_end() -> None:
+def test_progress_is_reported_up_to_the_end() -> None:
     told: list[tuple[int, int]] = []
     list(McapReader(io.BytesIO(DATA), "file", lambda *sizes: told.append(sizes)).messages())
     assert told == sorted(told)

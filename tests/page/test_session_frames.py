@@ -71,7 +71,7 @@ def drawn(log: Log, site: str, tick: int) -> list[Any]:
         ("two_sites", "m", ("s",), {"sites.m.view": JITTER, "sites.s.rate_hz": 400}),
     ],
 )
-def test_peers_are_drawn_as_the_log_says(
+def test_peers_are_drawn_as_logged(
     tmp_path: Path, scenario: str, site: str, peers: tuple[str, ...], links: dict[str, Any]
 ) -> None:
     keys = {"duration_s": 2.5, "link.delay_ms": 300, **links}

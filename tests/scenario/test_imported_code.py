@@ -99,7 +99,7 @@ def test_laws_for_several_sites_get_the_number(name: str, law: str) -> None:
     Site(load_scenario(name, {"control.law": f"tests.laws:{law}"}).setup("s"))
 
 
-def test_laws_are_not_told_the_unknown() -> None:
+def test_laws_do_not_get_unknown_parameters() -> None:
     unknown = {"sites.s.plant": "external", "sites.s.arm.known": False}
     parameters = []
 

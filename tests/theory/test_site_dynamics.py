@@ -92,7 +92,7 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
 
 @given(seed=seeds, law=laws)
 @settings(max_examples=50)
-def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
+def test_the_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     """Away from the surfaces of walls, where no derivative exists."""
     rng = np.random.default_rng(seed)
     random_site = site(

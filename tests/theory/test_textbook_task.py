@@ -171,9 +171,7 @@ def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance:
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
-def test_its_jacobian_is_the_difference_of_compiled_ticks(
-    text: str, name: str, law: str
-) -> None:
+def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str) -> None:
     site, step = build(text, name, law), 1e-6
     at = lay_out_arguments(site)
     state, peers = draw(site, 4, 0.0)

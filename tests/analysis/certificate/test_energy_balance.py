@@ -404,7 +404,7 @@ def test_the_balance_closes_with_order_two() -> None:
     assert share(certificates[500]) / share(certificates[1000]) == pytest.approx(4.0, rel=0.1)
 
 
-def test_it_closes_under_jitter_box_and_limit() -> None:
+def test_the_balance_closes_under_jitter_and_limits() -> None:
     jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
     box = judge(
         **{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2}

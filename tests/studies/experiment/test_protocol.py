@@ -103,7 +103,7 @@ def test_pairs_hold_two_masters() -> None:
     ]
 
 
-def test_digest_knows_what_was_planned() -> None:
+def test_the_digest_covers_the_plan() -> None:
     first = plan_experiment(make_protocol()).digest
     assert plan_experiment(make_protocol()).digest == first
     assert plan_experiment(make_protocol(seed=2)).digest != first

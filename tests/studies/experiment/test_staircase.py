@@ -55,7 +55,7 @@ def test_differences_follow_the_two_right_rule() -> None:
 
 
 @pytest.mark.parametrize("down", [1, 2, 3])
-def test_it_settles_where_levitt_says(down: int) -> None:
+def test_staircases_settle_at_levitts_point(down: int) -> None:
     """At the difference that a participant tells right with probability 0.5^(1 / down), by SciPy's normal."""
     stairs = Staircase("link.delay_ms", 100.0, factor=1.2, down=down, deviation=10.0)
     found = []

@@ -95,7 +95,7 @@ def test_more_trials_are_not_more_participants() -> None:
     assert once[0].p == pytest.approx(often[0].p)
 
 
-def test_what_a_pair_shares_is_counted_once() -> None:
+def test_shared_variance_of_pairs_counts_once() -> None:
     rows = [{**row, "pair": row["participant"] // 2} for row in draw(1, 12, [0.0, 1.0])]
     (users,), (pairs,) = (
         compare_conditions(rows, "time_s", unit=u) for u in ("participant", "pair")
@@ -117,7 +117,7 @@ def test_incomplete_participants_are_left_out() -> None:
     assert found == compare_conditions(texts, "time_s")
 
 
-def test_what_numbers_cannot_tell_is_none() -> None:
+def test_undecidable_numbers_are_none() -> None:
     (alone,) = compare_conditions(tidy({"a": [1.0], "b": [3.0]}), "time_s")
     assert (alone.difference, alone.p, alone.interval, alone.d_z) == (2.0, None, None, None)
     (same,) = compare_conditions(tidy({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.5, 0.6]}), "time_s")
@@ -375,7 +375,7 @@ def test_methods_paragraph_has_every_number_it_was_given() -> None:
         assert words in text
 
 
-def test_methods_paragraph_leaves_out_what_is_not_given() -> None:
+def test_methods_paragraph_omits_missing_facts() -> None:
     text = write_methods(
         {k: v for k, v in FACTS.items() if k not in ("pairs", "blocks", "exclusions", "alpha")}
     )
@@ -392,7 +392,7 @@ def test_methods_paragraph_leaves_out_what_is_not_given() -> None:
         ({"conditions": {"near": {"loss_percent": 1}}}, "condition near has no delay"),
     ],
 )
-def test_methods_paragraph_refuses_what_a_referee_would_ask(
+def test_methods_paragraph_refuses_incomplete_studies(
     changed: dict[str, Any], says: str
 ) -> None:
     facts = {key: value for key, value in {**FACTS, **changed}.items() if value is not None}

@@ -70,7 +70,7 @@ def test_wall_force_is_held_for_the_dwell(tmp_path: Path) -> None:
         assert row["work_j"] > 0.0
 
 
-def test_who_leaves_the_corridor_has_failed_at_once(tmp_path: Path) -> None:
+def test_leaving_the_corridor_fails_at_once(tmp_path: Path) -> None:
     done, rows = run(tmp_path, PAIR, f"{REACH}\ncorridor_m = 0.012")
     assert any(not row["succeeded"] for row in rows)
     for row, log in zip(rows, open_logs(done), strict=True):
@@ -144,7 +144,7 @@ def test_authority_moves_from_the_expert_trial_by_trial(tmp_path: Path) -> None:
         assert trial.make_goal().has_authority(5.0, 0) == (one.phase == "training")
 
 
-def test_what_was_learnt_is_before_less_after(tmp_path: Path) -> None:
+def test_learning_is_before_less_after(tmp_path: Path) -> None:
     done, rows = run(tmp_path, PAIR, TRACK, TRAINING)
     found = tn.analyse_experiment(done.folder)
     phases = defaultdict(list)

@@ -155,7 +155,7 @@ def test_roots_decide_for_arms_that_hardly_move(d: float, verdict: CellClass) ->
     assert result.verdict is verdict
 
 
-def test_a_run_that_diverges_says_when() -> None:
+def test_a_diverging_run_has_its_instant() -> None:
     result = judge_result(load_scenario(*RUNS["diverged"]), longest_s=100.0)
     assert result.motion is EndBehaviour.DIVERGED
     assert result.diverged_s == result.ran_s

@@ -175,7 +175,7 @@ def test_a_failure_carries_the_figures_and_the_command() -> None:
     assert "lost" in str(error.get("message"))
 
 
-def test_properties_say_what_was_run() -> None:
+def test_properties_describe_the_run() -> None:
     suite = document(mixed()).find("testsuite")
     assert suite is not None
     properties = {p.get("name"): p.get("value") for p in suite.iter("property")}
