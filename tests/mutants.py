@@ -147,7 +147,9 @@ class _Places(ast.NodeVisitor):
             (before.end_lineno, before.end_col_offset),
             (after.lineno, after.col_offset),
         )
-        low, high = (bisect_left(self._tokens, (place, "")) for place in (first, last))
+        low, high = (
+            bisect_left(self._tokens, (token_index, "")) for token_index in (first, last)
+        )
         tokens = [token for token in self._tokens[low:high] if token[1] not in ("(", ")")]
         if len(tokens) == 1 and tokens[0][1] in OTHERS:  # `is not` and `not in` are two
             self._add(*tokens[0], OTHERS[tokens[0][1]])
@@ -279,18 +281,18 @@ def ask_pytest(
 @cache
 def find_paper() -> dict[str, str]:
     """Returns the digests of the tree as it is."""
-    with tempfile.TemporaryDirectory() as made:
-        copy_tree(Path(made) / "tree")
-        return digest_paper(Path(made) / "tree")
+    with tempfile.TemporaryDirectory() as tree_copy:
+        copy_tree(Path(tree_copy) / "tree")
+        return digest_paper(Path(tree_copy) / "tree")
 
 
 @cache
 def find_quick_tests(workers: int) -> list[str]:
     """Returns the tests of the core that pass, and soon, where nothing is compiled."""
-    with tempfile.TemporaryDirectory() as made:
-        copy_tree(Path(made))
+    with tempfile.TemporaryDirectory() as tree_copy:
+        copy_tree(Path(tree_copy))
         options = [f"--timeout={QUICK_S}", "--timeout-method=signal", "-rp", "tests/core"]
-        output = ask_pytest(Path(made), options, workers, **INTERPRETED).stdout
+        output = ask_pytest(Path(tree_copy), options, workers, **INTERPRETED).stdout
     return re.findall(r"^PASSED (.+)$", output, re.MULTILINE)
 
 
@@ -374,8 +376,8 @@ def copy_tree(to: Path) -> None:
 
 def judge_mutant(mutant: Mutant, workers: int) -> str:
     """Returns the name of a test that fails with a change, or "" if it survives."""
-    with tempfile.TemporaryDirectory() as made:
-        tree = Path(made) / "tree"
+    with tempfile.TemporaryDirectory() as tree_copy:
+        tree = Path(tree_copy) / "tree"
         copy_tree(tree)
         (tree / mutant.path.relative_to(house.ROOT)).write_text(
             mutant.apply(), encoding="utf-8"
@@ -402,9 +404,9 @@ def main() -> int:
     arguments = parser.parse_args()
     print("| change | found by | s |\n|---|---|---|", flush=True)
     drawn = [
-        one
-        for one in draw_mutants(arguments.seed, arguments.count)
-        if re.search(arguments.only, str(one))
+        candidate
+        for candidate in draw_mutants(arguments.seed, arguments.count)
+        if re.search(arguments.only, str(candidate))
     ]
     survivors = 0
     for mutant in drawn:

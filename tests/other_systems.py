@@ -84,14 +84,19 @@ def read_typeshed() -> tuple[dict[str, list[str]], list[str]]:
     stubs, lacks, refused = Path(spec.origin).parent / "typeshed" / "stdlib", {}, []
     for file in stubs.rglob("*.pyi"):
         body = ast.parse(file.read_text(encoding="utf-8")).body
-        here, *there = (set(_list_names(body, platform)) for platform in ("linux", *OTHERS))
-        if missing := {name for name, _ in here.difference(set.intersection(*there))}:
+        linux_names, *other_names = (
+            set(_list_names(body, platform)) for platform in ("linux", *OTHERS)
+        )
+        if missing := {
+            name for name, _ in linux_names.difference(set.intersection(*other_names))
+        }:
             module = ".".join(file.relative_to(stubs).with_suffix("").parts).removesuffix(
                 ".__init__"
             )
             lacks[module] = sorted(missing)
             if not all(
-                any(own and not name.startswith("_") for name, own in names) for names in there
+                any(is_own and not name.startswith("_") for name, is_own in names)
+                for names in other_names
             ):
                 refused.append(module)
     return lacks, refused

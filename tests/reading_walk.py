@@ -109,20 +109,20 @@ def _names_in(node: ast.AST) -> Iterator[str]:
 
 def _resolve(path: Path, name: str) -> list[Place]:
     """Returns the definitions behind a name of a module, through aliases and tables."""
-    found = _module_names(path).get(name)
-    if isinstance(found, ast.expr):
+    binding = _module_names(path).get(name)
+    if isinstance(binding, ast.expr):
         return [
             place
-            for inner in _names_in(found)
+            for inner in _names_in(binding)
             if inner != name
             for place in _resolve(path, inner)
         ]
-    if not isinstance(found, Place):
+    if not isinstance(binding, Place):
         return []
     return (
-        [found]
-        if _definition(found) or found.module == path
-        else _resolve(found.module, found.name)
+        [binding]
+        if _definition(binding) or binding.module == path
+        else _resolve(binding.module, binding.name)
     )
 
 
@@ -246,11 +246,11 @@ class _Body:
             return (
                 classes
                 or self.classes(node.func)
-                or {c for one in node.args for c in self.classes(one)}
+                or {c for inner in node.args for c in self.classes(inner)}
             )
         below = ast.iter_child_nodes(node)
         return (
-            {c for one in below for c in self.classes(one)}
+            {c for inner in below for c in self.classes(inner)}
             if isinstance(node, ast.expr)
             else set()
         )
@@ -283,25 +283,27 @@ def _in_rooms(definition: Place) -> bool:
 @cache
 def _member(owner: Place, name: str) -> tuple[Place, ast.expr | None]:
     """Returns a method or field of a class or of its bases, and the type of its value."""
-    node, place = _definition(owner), owner._replace(name=f"{owner.name}.{name}")
-    method = _definition(place)
+    node, member_place = _definition(owner), owner._replace(name=f"{owner.name}.{name}")
+    method = _definition(member_place)
     if isinstance(method, ast.FunctionDef):
-        return place, method.returns
+        return member_place, method.returns
     for field in _fields(node) if isinstance(node, ast.ClassDef) else ():
         if isinstance(field.target, ast.Name) and field.target.id == name:
-            return place, field.annotation
+            return member_place, field.annotation
     for base in node.bases if isinstance(node, ast.ClassDef) else ():
         for base_class in _classes_in(owner.module, base) - {owner}:
             found = _member(base_class, name)
             if found[1] is not None:
                 return found
-    return place, None
+    return member_place, None
 
 
 def _classes_in(path: Path, part: ast.expr) -> set[Place]:
     """The classes that an annotation names."""
-    found = {one for name in _names_in(part) for one in _resolve(path, name)}
-    return {place for place in found if isinstance(_definition(place), ast.ClassDef)}
+    definitions = {
+        definition for name in _names_in(part) for definition in _resolve(path, name)
+    }
+    return {place for place in definitions if isinstance(_definition(place), ast.ClassDef)}
 
 
 def _in_order(node: ast.AST) -> Iterator[ast.AST]:

@@ -234,8 +234,8 @@ def prepare(page: str, folder: Path) -> None:
     if page == "docs/extend/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/extend/arms.md":
-        (own,) = (block for block in find_blocks(page) if block.text.startswith("name"))
-        (folder / "mine.toml").write_text(write_own_arm(folder, own.text))
+        (name_block,) = (block for block in find_blocks(page) if block.text.startswith("name"))
+        (folder / "mine.toml").write_text(write_own_arm(folder, name_block.text))
 
 
 @pytest.mark.parametrize(
@@ -246,13 +246,13 @@ def test_page_commands_print_their_shown_output(page: str, tmp_path: Path) -> No
     for block in find_blocks(page):
         if block.language != "sh" or find_exception(block):
             continue
-        for words, shown in read_commands(block.text):
-            shorter = SHORTER if "--tune" in words else []
-            done = trilat(*words[1:], *shorter, cwd=tmp_path)
-            assert done.code in (0, 1), (words, done)
+        for arguments, output in read_commands(block.text):
+            shorter = SHORTER if "--tune" in arguments else []
+            done = trilat(*arguments[1:], *shorter, cwd=tmp_path)
+            assert done.code in (0, 1), (arguments, done)
             printed = " ".join((done.out + done.err).split())
-            for line in shown:
-                assert line in printed, (words, line, done)
+            for line in output:
+                assert line in printed, (arguments, line, done)
 
 
 @pytest.mark.long
@@ -340,9 +340,9 @@ def check_ports(_: str, names: dict[str, Any]) -> None:
         for code_block in find_blocks("docs/studies/ports.md")
         if code_block.language == "sh"
     )
-    ((_, shown),) = read_commands(block.text)
+    ((_, output),) = read_commands(block.text)
     results = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
-    assert shown == [" ".join(line.split()) for line in results[:2]]
+    assert output == [" ".join(line.split()) for line in results[:2]]
 
 
 def check_energies(_: str, names: dict[str, Any]) -> None:
@@ -385,7 +385,7 @@ def list_shown(page: str) -> list[str]:
     """Returns the output that a page shows: the block right after the code."""
     blocks = find_blocks(page)
     text = (ROOT / page).read_text(encoding="utf-8")
-    shown: list[str] = []
+    output_lines: list[str] = []
     for code, after in pairwise(blocks):
         between = text.partition(code.text)[2].partition(after.text)[0]
         if (
@@ -393,8 +393,8 @@ def list_shown(page: str) -> list[str]:
             and after.language == ""
             and between.split() == ["```", "```text"]
         ):
-            shown += after.text.splitlines()
-    return shown
+            output_lines += after.text.splitlines()
+    return output_lines
 
 
 @pytest.mark.long
@@ -419,9 +419,9 @@ def test_code_about_sweeps_reads_their_results(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_certificates_begin_as_shown_on_their_page(tmp_path: Path) -> None:
     trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
-    (shown,) = (
+    (output,) = (
         b.text
         for b in find_blocks("docs/logs/certificate.md")
         if b.text.startswith("ok   stable")
     )
-    assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(shown.rstrip())
+    assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(output.rstrip())

@@ -271,8 +271,8 @@ def test_ending_programs_release_their_switch(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(
         sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"]
     )
-    with os.fdopen(ends[0]) as there:
-        monkeypatch.setattr(sys, "stdin", there)
+    with os.fdopen(ends[0]) as reader:
+        monkeypatch.setattr(sys, "stdin", reader)
         runpy.run_path(str(LOOK.with_name("dead_man_switch.py")), run_name="__main__")
     assert switch.said == [True, False]
 

@@ -50,15 +50,15 @@ def make(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
 @pytest.mark.parametrize("folder", [False, True])
 def test_only_the_finished_output_remains(folder: bool, tmp_path: Path) -> None:
     make(tmp_path / "out", "1", folder=folder)
-    there = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
-    assert everything(tmp_path) == there
+    expected_files = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
+    assert everything(tmp_path) == expected_files
     with pytest.raises(
         UsageError, match="exists; choose another name, or replace it with force=True"
     ):
         make(tmp_path / "out", "2", folder=folder)
-    assert everything(tmp_path) == there
+    assert everything(tmp_path) == expected_files
     make(tmp_path / "out", "3", folder=folder, force=True)
-    assert everything(tmp_path) == {name: text and "3" for name, text in there.items()}
+    assert everything(tmp_path) == {name: text and "3" for name, text in expected_files.items()}
 
 
 def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
@@ -75,10 +75,10 @@ def test_failures_keep_the_former_files(
 ) -> None:
     if before:
         make(tmp_path / "out", "1", folder=folder)
-    there = everything(tmp_path)
+    former_files = everything(tmp_path)
     with pytest.raises(type(error)):
         break_off(tmp_path / "out", error, folder=folder)
-    assert everything(tmp_path) == there
+    assert everything(tmp_path) == former_files
 
 
 def test_full_disks_have_an_exit_code(tmp_path: Path) -> None:

@@ -33,10 +33,10 @@ def test_every_command_of_the_readme_is_run() -> None:
 
 
 def test_the_readme_shows_its_first_judgement(tmp_path: Path) -> None:
-    (shown,) = (block.text for block in find_blocks("README.md") if not block.language)
+    (readme_output,) = (block.text for block in find_blocks("README.md") if not block.language)
     trilat("sim", "two_people", "-o", "run.mcap", cwd=tmp_path).succeeds()
     printed = trilat("certify", "run.mcap", cwd=tmp_path).succeeds().splitlines()
-    assert printed[0] == shown.strip()
+    assert printed[0] == readme_output.strip()
     assert len([line for line in printed if line.startswith(("ok ", "note "))]) == 9
     page = (ROOT / "docs/tutorials/first-result.md").read_text(encoding="utf-8")
     explained = re.findall(r"^\| `(.+?)` \|", page, re.MULTILINE)

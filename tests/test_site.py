@@ -50,7 +50,7 @@ def test_the_first_pages_links_exist() -> None:
     named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
     assert len(named) > 60
     places = [ROOT / "docs" / name for name in named if name not in MAKE.BESIDE]
-    assert [place for place in places if not place.is_file()] == []
+    assert [missing for missing in places if not missing.is_file()] == []
 
 
 def test_the_menu_has_nine_entries_at_most() -> None:

@@ -845,7 +845,7 @@ class Tally(NamedTuple):
 
 def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
     """Returns the counts of the words of `by`: wrongly stable, wrongly not, settled, and open."""
-    rows = [(one.truth, getattr(one, by)) for one in judged]
+    rows = [(entry.truth, getattr(entry, by)) for entry in judged]
     return Tally(
         len(rows),
         sum(truth.unstable for truth, _ in rows),
@@ -859,7 +859,7 @@ def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
 
 def tally_clear(judged: Iterable[Judged], by: str = "certified") -> Tally:
     """Returns the same counts for experiments that are not near an edge."""
-    return tally((one for one in judged if not one.truth.near), by)
+    return tally((entry for entry in judged if not entry.truth.near), by)
 
 
 def main() -> None:
@@ -884,8 +884,8 @@ def main() -> None:
         ]
     print_table(judged)
     for seed, one in zip((*drawn, *hidden), judged, strict=True):
-        found = tally([one])
-        if found.false_ok or found.false_alarm:
+        counts = tally([one])
+        if counts.false_ok or counts.false_alarm:
             print(f"seed {seed}: {one.drawn.kind}, {one.truth}: {one.certified}")
 
 
@@ -911,12 +911,12 @@ def print_table(judged: list[Judged]) -> None:
     columns = "runs | unstable | near an edge | false ok | false alarms | settled | open"
     print(f"| experiments | {columns} |")
     print("|---|" + " --: |" * len(Tally._fields))
-    kinds = sorted({(one.drawn.has == "hidden", one.drawn.kind) for one in judged})
+    kinds = sorted({(entry.drawn.has == "hidden", entry.drawn.kind) for entry in judged})
     for hides, kind in kinds:
         groups = [
-            one
-            for one in judged
-            if (one.drawn.has == "hidden", one.drawn.kind) == (hides, kind)
+            entry
+            for entry in judged
+            if (entry.drawn.has == "hidden", entry.drawn.kind) == (hides, kind)
         ]
         print(f"| {kind} | " + " | ".join(map(str, tally(groups))) + " |")
     total = tally(judged)

@@ -32,7 +32,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return (
             "{ "
-            + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items())
+            + ", ".join(f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items())
             + " }"
         )
     if isinstance(value, list | tuple):
@@ -142,18 +142,18 @@ def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
 
 
 def _draw_network(rng: np.random.Generator) -> Drawn:
-    made = _loop(rng, "abce"[: rng.integers(2, 5)])
-    return Drawn("network", experiment("network", **made), "control.d")
+    loop_keys = _loop(rng, "abce"[: rng.integers(2, 5)])
+    return Drawn("network", experiment("network", **loop_keys), "control.d")
 
 
 def _draw_noisy(rng: np.random.Generator) -> Drawn:
-    made = _loop(rng, "abc"[: rng.integers(2, 4)])
-    made["link"] |= {
+    loop_keys = _loop(rng, "abc"[: rng.integers(2, 4)])
+    loop_keys["link"] |= {
         "model": "uniform",
-        "half_width_ms": min(3.0, made["link"]["delay_ms"]),
+        "half_width_ms": min(3.0, loop_keys["link"]["delay_ms"]),
         "loss": 0.02,
     }
-    return Drawn("noise", experiment("noise", **made), "control.d")
+    return Drawn("noise", experiment("noise", **loop_keys), "control.d")
 
 
 def _draw_groups(rng: np.random.Generator) -> Drawn:
@@ -174,16 +174,17 @@ def _draw_adaptive(rng: np.random.Generator) -> Drawn:
     """Draws the paper's law at rates at which sampling may feed it."""
     names = "abc"[: rng.integers(2, 4)]
     late = rng.random() < 0.6
-    made = _loop(
+    loop_keys = _loop(
         rng, names, link={"delay_ms": float(rng.uniform(20.0, 500.0)) if late else 0.0}
     )
-    made["control"] = {
+    loop_keys["control"] = {
         "law": "adaptive",
         "Kp": float(rng.uniform(0.5, 3.0)),
         "Kd": float(rng.uniform(1.0, 5.0)),
     }
     return Drawn(
-        "adaptive", experiment("adaptive", **{**made, "rate_hz": int(rng.choice([50, 100]))})
+        "adaptive",
+        experiment("adaptive", **{**loop_keys, "rate_hz": int(rng.choice([50, 100]))}),
     )
 
 
@@ -196,10 +197,10 @@ def _draw_delay(rng: np.random.Generator) -> Drawn:
         "amplitude_ms": T * float(rng.choice([0.1, 0.9])),
         "period_s": 1.0 / rng.uniform(1.0, 2.5),
     }
-    made = _loop(rng, "abc", link=link)
+    loop_keys = _loop(rng, "abc", link=link)
     if rng.random() < 0.5:
-        made["control"] = {"law": "adaptive"}
-    return Drawn("delay", experiment("delay", **made))
+        loop_keys["control"] = {"law": "adaptive"}
+    return Drawn("delay", experiment("delay", **loop_keys))
 
 
 def _draw_wall(rng: np.random.Generator) -> Drawn:
@@ -207,26 +208,26 @@ def _draw_wall(rng: np.random.Generator) -> Drawn:
     edge = 15.5e3 * rate_hz / 1000
     K = edge * (rng.uniform(0.8, 1.2) if rng.random() < 0.5 else rng.uniform(0.2, 2.5))
     # The stored truths are those of the speed limit that `windup` had when they were found.
-    made = {
+    loop_keys = {
         SAMPLED: True,
         STIFFNESS: K,
         "rate_hz": rate_hz,
         "duration_s": DRAWN_S,
         "limits.qd_limit_rad_s": 100.0,
     }
-    return Drawn("wall", load_scenario("windup", made), STIFFNESS)
+    return Drawn("wall", load_scenario("windup", loop_keys), STIFFNESS)
 
 
 def _draw_operator(rng: np.random.Generator) -> Drawn:
     """Draws a hand that swings to the end, or lets go long before the end."""
-    made = _loop(rng, "abc")
-    made["control"] = p_d(float(rng.uniform(2.0, 6.0)))
+    loop_keys = _loop(rng, "abc")
+    loop_keys["control"] = p_d(float(rng.uniform(2.0, 6.0)))
     until_s = DRAWN_S - 0.02 if rng.random() < 0.5 else 0.3 * DRAWN_S
     hand = swinging(
         [(0.0, 0.0), (until_s, float(rng.uniform(2.0, 10.0)))], float(rng.uniform(0.3, 1.5))
     )
-    made["sites"]["a"]["hands"] = [hand]
-    return Drawn("operator", experiment("operator", **made))
+    loop_keys["sites"]["a"]["hands"] = [hand]
+    return Drawn("operator", experiment("operator", **loop_keys))
 
 
 KINDS: tuple[tuple[float, Callable[[np.random.Generator], Drawn]], ...] = (
@@ -397,28 +398,28 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
             sites[name]["rate_hz"] = int(rng.choice([rate_hz // 2, rate_hz, 3 * rate_hz // 4]))
     link, keys = _draw_link(rng)
     touch = _draw_touch(rng, sites)
-    made: dict[str, Any] = {"link": keys, "dominance": _shares(rng, names)}
+    loop_keys: dict[str, Any] = {"link": keys, "dominance": _shares(rng, names)}
     starts = np.array(sites["a"]["q0_rad"]).round(3)
     if law in ("adaptive", "p_d", "pd_d") and rng.random() < 0.25:
-        made["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
+        loop_keys["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
         starts = np.array([0.2, 1.4])
     elif touch == "nobody" and rng.random() < 0.15 and law != "adaptive_kinematics":
-        made["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
+        loop_keys["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
         starts, space = np.array([0.2, -1.0, 1.2]), "chain"
         for name in names:
             del sites[name]["arm"]
             sites[name]["control"].pop("theta_hat0", None)
-    made |= {
+    loop_keys |= {
         "rate_hz": rate_hz,
         "duration_s": DRAWN_S,
         "scheme": str(rng.choice(["second_order", "digital"])),
     }
     if law in ("wave", "tdpa", "tanks"):
-        made["scheme"] = "digital"
+        loop_keys["scheme"] = "digital"
     for name in names:
         sites[name]["q0_rad"] = starts.tolist()
-    alike = experiment("wide", sites=sites, **made)
-    apart = {
+    alike = experiment("wide", sites=sites, **loop_keys)
+    start_keys = {
         f"sites.{name}.q0_rad": [
             float(q + round(spread * x, 13)) for q, x in zip(starts, row, strict=True)
         ]
@@ -426,7 +427,7 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
             names, rng.uniform(-1.0, 1.0, (len(names), len(starts))), strict=True
         )
     }
-    return Drawn(law, load_scenario(alike, apart), has=f"{link}, {touch}, {space}")
+    return Drawn(law, load_scenario(alike, start_keys), has=f"{link}, {touch}, {space}")
 
 
 def draw_experiment(seed: int) -> Drawn:

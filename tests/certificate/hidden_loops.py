@@ -115,7 +115,7 @@ def _draw_loop(rng: np.random.Generator, way: Callable[[], Way]) -> Hidden:
     pairs = [(i, j) for i in range(count) for j in range(count) if shares[i, j] > 0.0]
     stiffness = float(_round(rng.uniform(8.0, 30.0), 3))
     ways = {pair: way() for pair in pairs}
-    mean_s = 1e-3 * np.mean([_mean_ms(one) for one in ways.values()])
+    mean_s = 1e-3 * np.mean([_mean_ms(link_way) for link_way in ways.values()])
     damping = 0.6 * stiffness * (mean_s + 1.0 / RATE_HZ)
     loop = Loop(
         inertias,

@@ -157,12 +157,12 @@ def test_sweeps_of_widely_drawn_runs_are_right() -> None:
     """The same by the compiled run alone; chains and task space need layouts of their own."""
     drawn = [(seed, draw_experiment(seed)) for seed in WIDELY]
     known = [
-        (seed, one)
-        for seed, one in drawn
-        if one.kind in OF_THE_CORE and one.has.endswith("joints")
+        (seed, drawn_case)
+        for seed, drawn_case in drawn
+        if drawn_case.kind in OF_THE_CORE and drawn_case.has.endswith("joints")
     ]
     assert len(LOGGED) + len(SWEPT) + len(HIDDEN_PUSH) + len(known) == BLOCK
-    _hold(tally_clear([_sweep(seed, one) for seed, one in known], "swept"))
+    _hold(tally_clear([_sweep(seed, drawn_case) for seed, drawn_case in known], "swept"))
 
 
 def _hold(found: Tally) -> None:

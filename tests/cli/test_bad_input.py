@@ -250,7 +250,7 @@ def test_pipes_are_refused_for_other_files_too(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     trilat("ping", "--zenoh-config", "pipe", cwd=tmp_path).refuses("a pipe or a device")
     for settings in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
-        options = [word for one in settings for word in ("--set", one)]
+        options = [word for setting in settings for word in ("--set", setting)]
         trilat("scenario", "check", "two_sites", *options, cwd=tmp_path).refuses(
             "a pipe or a device"
         )
@@ -300,8 +300,8 @@ def test_foreign_text_cannot_control_a_terminal() -> None:
     table = Table(title=attack)
     table.add_column(attack)
     table.add_row(attack)
-    for one in (attack, table):
-        console.print(one)
+    for hostile in (attack, table):
+        console.print(hostile)
     with contextlib.redirect_stdout(stream):
         print_line(attack)
         print_json({"text": attack})

@@ -16,10 +16,12 @@ def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
         in trilat("experiment", "check", "reaching.toml", cwd=tmp_path).succeeds()
     )
     shorten(tmp_path / "reaching.toml")
-    told = trilat("experiment", "run", "reaching.toml", "--jobs", "1", cwd=tmp_path).succeeds()
+    run_output = trilat(
+        "experiment", "run", "reaching.toml", "--jobs", "1", cwd=tmp_path
+    ).succeeds()
     folder = "runs/experiment-reaching-001"
-    assert f"4 trials, into {folder}; after Ctrl-C, continue with" in told
-    assert "reaching: 4 of 4 trials" in told
+    assert f"4 trials, into {folder}; after Ctrl-C, continue with" in run_output
+    assert "reaching: 4 of 4 trials" in run_output
     again = json.loads(trilat("experiment", "run", folder, "--json", cwd=tmp_path).out)
     assert (again["done"], again["conditions"]) == (4, ["no_delay", "delay_300"])
     assert "4 of 4" in trilat("experiment", "status", folder, cwd=tmp_path).succeeds()

@@ -106,10 +106,10 @@ def test_help_ends_with_an_example_and_page(command: str) -> None:
 
 @pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
 def test_help_starts_with_one_sentence(command: str) -> None:
-    found: Any = typer.main.get_command(app)
+    command_found: Any = typer.main.get_command(app)
     for word in command.split():
-        found = found.commands[word]
-    purpose = found.help.split("\n\n")[0]
+        command_found = command_found.commands[word]
+    purpose = command_found.help.split("\n\n")[0]
     assert re.fullmatch(r"[A-Z][^\n]*[.?]", purpose)
     assert not re.search(r"[.?] [A-Z]", purpose)
 
@@ -132,13 +132,13 @@ def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:
             continue
         accepts = "folders with MCAP logs" in text
         assert accepts == (command == ["log", "export"])
-        words = ["--key", "x.key"] if command == ["log", "sign"] else []
+        key_options = ["--key", "x.key"] if command == ["log", "sign"] else []
         if accepts:
-            words = ["--to", "csv", "-o", "tables"]
+            key_options = ["--to", "csv", "-o", "tables"]
         if command == ["log", "view"]:
-            words = ["--save", "view.rrd"]
+            key_options = ["--save", "view.rrd"]
         count = 2 if command == ["compare"] else 1
-        done = trilat(*command, *["logs"] * count, *words, cwd=tmp_path)
+        done = trilat(*command, *["logs"] * count, *key_options, cwd=tmp_path)
         assert (done.code == 0) == accepts, done
         if not accepts and command != ["log", "sign"]:
             assert "is a folder, not a file" in done.err, (command, done)

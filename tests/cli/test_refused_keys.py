@@ -82,9 +82,14 @@ OF_ANOTHER = [
 def test_commands_take_the_keys_of_their_member(
     arguments: Sequence[str], whose: str, due: str, key_folders: Path, tmp_path: Path
 ) -> None:
-    place = arguments.index("link") if "link" in arguments else len(arguments)
-    given = [*arguments[:place], "--keys", str(key_folders / "k" / whose), *arguments[place:]]
-    trilat(*given, cwd=tmp_path).refuses(TWO_NAMES.format(whose, due))
+    insertion = arguments.index("link") if "link" in arguments else len(arguments)
+    command = [
+        *arguments[:insertion],
+        "--keys",
+        str(key_folders / "k" / whose),
+        *arguments[insertion:],
+    ]
+    trilat(*command, cwd=tmp_path).refuses(TWO_NAMES.format(whose, due))
     assert list(tmp_path.iterdir()) == []
 
 

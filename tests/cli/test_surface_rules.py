@@ -85,15 +85,17 @@ def test_created_files_are_named_in_json(tmp_path: Path) -> None:
     )
     assert facts["files"] == ["two_sites.mcap"]
     assert facts["sites"]["m"]["records"] == 100
-    asked = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
-    assert json.loads(trilat(*asked, cwd=tmp_path).succeeds())["records"] == {
+    command = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
+    assert json.loads(trilat(*command, cwd=tmp_path).succeeds())["records"] == {
         "m": 100,
         "s": 100,
     }
     shipped = json.loads(trilat("scenario", "list", "--json", cwd=tmp_path).succeeds())
     assert {"free", "paper"} < {scenario["name"] for scenario in shipped}
-    told = json.loads(trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds())
-    assert told["sha256"] == tn.load_scenario("paper").sha256
+    check_facts = json.loads(
+        trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds()
+    )
+    assert check_facts["sha256"] == tn.load_scenario("paper").sha256
     ran = json.loads(trilat("test", "free", "--jobs", "1", "--json", cwd=tmp_path).out)
     assert ran["held"]
     assert [run["seed"] for run in ran["runs"]] == [1]

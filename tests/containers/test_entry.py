@@ -165,14 +165,14 @@ for name in {*members, "authority"}:
 def volumes() -> Iterator[Path]:
     """The members' volumes, which any user may read, and the program's volume."""
     with tempfile.TemporaryDirectory() as name:
-        place = Path(name)
-        place.chmod(0o755)
+        volume_folder = Path(name)
+        volume_folder.chmod(0o755)
         for folder in ("keys/recorder", "keys/m1", "keys/s", "scratch"):
-            (place / folder).mkdir(parents=True)
-            (place / folder).chmod(0o1777)
-        (place / "program").write_text(PROGRAM)
-        (place / "program").chmod(0o755)
-        yield place / "keys"
+            (volume_folder / folder).mkdir(parents=True)
+            (volume_folder / folder).chmod(0o1777)
+        (volume_folder / "program").write_text(PROGRAM)
+        (volume_folder / "program").chmod(0o755)
+        yield volume_folder / "keys"
 
 
 def hand_out(volumes: Path, user: Any) -> None:

@@ -99,7 +99,7 @@ def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
             {"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}
         ),  # elbows bent, and none hangs
     }
-    apart = set_apart(law, **more)
+    far_scenario = set_apart(law, **more)
     orders = {
         "s": {
             2800: "stop",
@@ -109,7 +109,7 @@ def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
             7000: "stop",
             7040: "enable",
         },
-        apart.names[0]: {
+        far_scenario.names[0]: {
             5500: "arm_lost",
             5530: "stop",
             6000: "reset",
@@ -117,7 +117,7 @@ def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
             6400: "reset",
         },
     }
-    log = ordered(apart, orders)
+    log = ordered(far_scenario, orders)
     modes = {str(mode) for site in log.sites for mode in log[site].mode}
     assert {"waiting", "return", "run", "hold", "stopped", "fault"} <= modes
     for site in log.sites:
@@ -139,8 +139,10 @@ def test_arms_far_apart_approach_slowly(law: str) -> None:
     """3 rad apart, at 2 rad/s and the law's own speed, at the start and after a stop; no spring
     is wound up.
     """
-    apart = set_apart(law, duration_s=6.0)
-    unheld = load_scenario(apart, {f"sites.{site}.hands": [] for site in apart.names})
+    far_scenario = set_apart(law, duration_s=6.0)
+    unheld = load_scenario(
+        far_scenario, {f"sites.{site}.hands": [] for site in far_scenario.names}
+    )
     log = ordered(unheld, {"s": {1200: "stop", 4000: "enable"}})
     for site in log.sites:
         assert np.abs(log[site].qd).max() < 2.5 * RULE["align_speed_rad_s"], site

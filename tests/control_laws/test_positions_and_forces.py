@@ -116,12 +116,12 @@ def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
     alpha = complementary_shares(a)
     *users, root, ratios = SHARED[a]
     for at, values in enumerate(users):
-        found = [
+        felt_ratios = [
             transmitted(hz, alpha, at, acceleration=qdd)
             for qdd in (0.0, 1.0)
             for hz in (0.1, 1.0)
         ]
-        assert found == [approximate_printed(value) for value in values]
+        assert felt_ratios == [approximate_printed(value) for value in values]
     assert rightmost_root(alpha, USERS) == pytest.approx(root, abs=5e-4)
     beta = np.array(complementary_weights(a))
     assert beta @ (np.eye(3) - alpha) == pytest.approx(0.0, abs=1e-15)

@@ -37,10 +37,12 @@ def behind(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
 
 def releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
     """Returns the first tick of the receiver that may use each sample, or LOST, from a channel alone."""
-    made = due(channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count).tolist()
+    release_times = due(
+        channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count
+    ).tolist()
     return [
         LOST if ns == LOST else first_tick_at(max(ns, tick_ns(m, peer_rate_hz) + 1), rate_hz)
-        for m, ns in enumerate(made)
+        for m, ns in enumerate(release_times)
     ]
 
 
@@ -56,13 +58,13 @@ def test_the_newest_due_arrived_sample_is_used(
     """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
     release = releases(name, 251, *rates)
     site = behind(name, *rates)
-    there: set[int] = set()
+    arrived: set[int] = set()
     before = -1
     for k in range(TICKS):
         now = came[k] if k < len(came) else []
-        there.update(now)
+        arrived.update(now)
         output = site.step(TickInput(k, [sample(m) for m in now]))
-        assert output.used == [max((m for m in there if LOST < release[m] <= k), default=-1)]
+        assert output.used == [max((m for m in arrived if LOST < release[m] <= k), default=-1)]
         assert output.used[0] >= before
         before = output.used[0]
         if before >= 0:

@@ -35,15 +35,15 @@ def strongly_connected(a: Array) -> bool:
     """Walks from the first site along the edges and against them."""
 
     def reached(edges: Array) -> set[int]:
-        found, new = {0}, [0]
+        visited, new = {0}, [0]
         while new:
             new = [
                 j
                 for i in new
                 for j in np.flatnonzero(edges[i])
-                if j not in found and not found.add(j)
+                if j not in visited and not visited.add(j)
             ]
-        return found
+        return visited
 
     return len(reached(a)) == len(reached(a.T)) == len(a)
 

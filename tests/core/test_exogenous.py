@@ -95,8 +95,8 @@ def test_external_torques_add_up(q: Array, qd: Array, t_s: float) -> None:
         TorqueSource(TorqueKind.VISCOUS, B=(2.0, 3.0)),
         TorqueSource(TorqueKind.WALL, K=(100.0, 0.0), a=(0.5, 0.0), b=(-1.0, 0.0)),
     )
-    apart = sum(torque(t_s, q, qd, actor) for actor in actors)
-    assert torque(t_s, q, qd, *actors) == pytest.approx(apart, abs=1e-9)
+    torque_sum = sum(torque(t_s, q, qd, actor) for actor in actors)
+    assert torque(t_s, q, qd, *actors) == pytest.approx(torque_sum, abs=1e-9)
 
 
 @given(q=angles, K=stiff, target=pairs)

@@ -69,7 +69,9 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
     start = np.concatenate([q, qd])
     exact = solve_ivp(rate, (0.0, SPAN_S), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     ends = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
-    return [float(np.abs(one - exact).max() / (1 + np.abs(exact).max())) for one in ends]
+    return [
+        float(np.abs(end_state - exact).max() / (1 + np.abs(exact).max())) for end_state in ends
+    ]
 
 
 @settings(max_examples=10)

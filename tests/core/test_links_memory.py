@@ -90,17 +90,20 @@ def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataOb
     widest = wide(widest, calendar_pages(rates[0]))
     first = grown._arrays.calendars.shape[1]
     now = 0
-    came = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
+    arrival_ticks = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
     for batch in data.draw(
-        st.lists(st.tuples(st.lists(came, max_size=5), ORDERS, st.integers(1, 900)), max_size=6)
+        st.lists(
+            st.tuples(st.lists(arrival_ticks, max_size=5), ORDERS, st.integers(1, 900)),
+            max_size=6,
+        )
     ):
         ahead, model, idle = batch
-        here = now * rates[1] // rates[0]
+        own_tick = now * rates[1] // rates[0]
         orders = []
         if model is not None:
             from_ns = (now + rates[0] // 10) * 10**9 // rates[0]
             orders = [CoreChange("order", 0, model._replace(from_ns=from_ns))]
-        tick = TickInput(now, [sample(max(here + m, 0)) for m in ahead], orders)
+        tick = TickInput(now, [sample(max(own_tick + m, 0)) for m in ahead], orders)
         assert grown.step(tick) == widest.step(tick)
         idly = [TickInput(now + n) for n in range(1, idle)]
         assert stepped(grown, idly) == stepped(widest, idly)

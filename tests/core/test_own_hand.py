@@ -52,21 +52,21 @@ def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
             in_order[came] = asked, goal
     later = run(in_order)
     first = min(in_order)
-    assert [one.number for one in later[:first]] == [-1] * first
+    assert [state.number for state in later[:first]] == [-1] * first
     if len(in_order) == len(goals):
         assert later == prompt
 
 
 def test_hands_take_hold_after_their_delay() -> None:
     hand_states = run({0: (0, (0.6, -0.25))})
-    held = [k for k, one in enumerate(hand_states) if one.source == PROGRAM]
+    held = [k for k, state in enumerate(hand_states) if state.source == PROGRAM]
     assert held[0] == DELAY
     assert hand_states[DELAY].target == PLACE
 
 
 def test_a_decision_that_is_late_acts_at_once() -> None:
     hand_states = run({DELAY + 7: (0, (0.6, -0.25))})
-    assert [one.source for one in hand_states[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
+    assert [state.source for state in hand_states[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
 
 
 def test_an_older_decision_is_ignored() -> None:

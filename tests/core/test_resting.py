@@ -226,16 +226,16 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
             *(read_output(part.states[row], part.peers) for row in (at - 2, at - 1))
         )
         order = [CoreChange("stop", order=LifeOrder.STOP)]
-        made = [
+        stops = [
             site.step(TickInput(k, commands=order if k == at else ()))
             for k in range(at, at + ticks)
         ]
         qd, q = (
-            np.array([record.qd for record in made]),
-            np.array([record.q for record in made]),
+            np.array([record.qd for record in stops]),
+            np.array([record.q for record in stops]),
         )
         speed = np.abs(qd).max(axis=1)
-        pushed = np.array([record.tau_x for record in made])
+        pushed = np.array([record.tau_x for record in stops])
         given = yielding(log.scenario.setup(part.name).rest, pushed, part.rate_hz)
         moving = np.flatnonzero((np.abs(qd) > AT_REST_RAD_S + np.abs(given)).any(axis=1))
         rest_s = float(moving[-1] + 1) / part.rate_hz if len(moving) else 0.0

@@ -148,15 +148,15 @@ ROBOTS = Path(__file__).parents[1] / "scenario/robots"
 
 
 def parse_chains() -> list[tuple[str, str, str, int]]:
-    found, file = [], ""
+    chains, file = [], ""
     for word in CHAINS.split():
         if word.endswith(".urdf"):
             file = word
         else:
             ends, _, n = word.rpartition(":")
             base, _, tip = ends.rpartition(">")
-            found.append((file, base, tip, int(n)))
-    return found
+            chains.append((file, base, tip, int(n)))
+    return chains
 
 
 def read_robot(file: str) -> str:

@@ -120,8 +120,8 @@ def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
     virtual.record_virtual(load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ)
     channels = read_ros2_channels(path)
     about = {
-        topic.rpartition("/")[2]: one.about
-        for topic, one in channels.items()
+        topic.rpartition("/")[2]: channel_data.about
+        for topic, channel_data in channels.items()
         if "/viz/m2/" in topic
     }
     sent = {
@@ -151,7 +151,7 @@ def test_tables_name_messages_with_their_units() -> None:
     columns = {
         column.source: column for column in table.columns if column.source.startswith("ch.")
     }
-    assert {source: (one.name, one.unit) for source, one in columns.items()} == {
+    assert {source: (data.name, data.unit) for source, data in columns.items()} == {
         "ch.energy[0]": ("ch_energy_j", "J"),
         "ch.target[m1][0]": ("ch_target_m1_1_rad", "rad"),
         "ch.target[m1][1]": ("ch_target_m1_2_rad", "rad"),

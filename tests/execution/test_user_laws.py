@@ -102,8 +102,16 @@ def test_reports_explain_hidden_memory() -> None:
         findings = run_log_checks(log, virtual=False, **settings).findings
         return next(finding.text for finding in findings if finding.check == "executed again")
 
-    words = ["trilat", "verify", *log.sources, "--law", str(law.file), "--resume-every", "100"]
-    command = join_arguments(words)
+    verify_command = [
+        "trilat",
+        "verify",
+        *log.sources,
+        "--law",
+        str(law.file),
+        "--resume-every",
+        "100",
+    ]
+    command = join_arguments(verify_command)
     assert find_text().endswith(f"but by: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
     built_in = run_log_checks(opened(recorded("paper")), virtual=False)

@@ -102,11 +102,11 @@ def run_tests(names: Sequence[str]) -> dict[str, str]:
     for word, name in re.findall(
         r"^(PASSED|FAILED|ERROR|SKIPPED) (\S+)", done.stdout, re.MULTILINE
     ):
-        for asked in names:
-            if name.startswith(asked):
-                ends.setdefault(asked, set()).add(word)
+        for listed in names:
+            if name.startswith(listed):
+                ends.setdefault(listed, set()).add(word)
     bad = {"FAILED", "ERROR"}
-    return {name: "failed" if bad & found else "passed" for name, found in ends.items()}
+    return {name: "failed" if bad & bad_tests else "passed" for name, bad_tests in ends.items()}
 
 
 class Evidence(NamedTuple):
@@ -185,7 +185,9 @@ def describe_torques(seeds: Seeds) -> str:
     stepped = ", ".join(f"{mode} {step_nm:.3g}" for mode, step_nm in sorted(steps.items()))
     undisturbed_nm = find_undisturbed_step()
     allowed_nm = allowed_step(make_scenario(), undisturbed_nm)
-    at_rest_j, before_j = (max(one.rises_j[place] for one in seeds.judged) for place in (0, 1))
+    at_rest_j, before_j = (
+        max(one.rises_j[mode_index] for one in seeds.judged) for mode_index in (0, 1)
+    )
     return (
         f"Largest step of a torque in a tick, N m: {stepped} (`start`: the first 0.1 s of every start). "
         f"Allowed are {allowed_nm:.3g}, the larger of the limit of its rate and 1.1 times the "
@@ -213,16 +215,16 @@ def main() -> int:
         ends = run_tests(
             find_tests([name for row in ROWS for name in (*row.virtual, *row.real)])
         )
-        found = [find_evidence(row, seeds, ends) for row in ROWS]
+        all_evidence = [find_evidence(row, seeds, ends) for row in ROWS]
         write_table(
             MATRIX,
             ("number", "fault", "what must happen", "not tried"),
-            [describe_row(evidence) for evidence in found],
+            [describe_row(evidence) for evidence in all_evidence],
         )
         write_table(
             TESTS,
             ("fault", "evidence", "result"),
-            [line for evidence in found for line in list_evidence(evidence)],
+            [line for evidence in all_evidence for line in list_evidence(evidence)],
         )
         write_table(COUNTS, ("event", "count"), count_visits(seeds))
         TORQUES.write_text(torques + "\n", "utf-8")
@@ -230,7 +232,13 @@ def main() -> int:
         before, _, rest = text.partition(BEGIN)
         block = "\n".join([BEGIN, "", *lines, "", END])
         PAGE.write_text(before + block + rest.partition(END)[2], "utf-8")
-        print("\n".join(" | ".join(describe_row(one)) for one in found if not one.holds))
+        print(
+            "\n".join(
+                " | ".join(describe_row(row_found))
+                for row_found in all_evidence
+                if not row_found.holds
+            )
+        )
     return int(bool(seeds.failed))
 
 

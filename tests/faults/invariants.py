@@ -276,7 +276,7 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
     for start, following in pairwise(starts):
         newest_ticks = [start[0].tick - 1]
         for other, states in published.states.items():
-            place = (
+            first_unheard = (
                 [peer for peer in published.states if peer != other].index(name)
                 if other != name
                 else -1
@@ -284,7 +284,10 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
             for stretch in stretches(states) if other != name else ():
                 if stretch[-1].tick >= following[0].tick:
                     newest_ticks += [
-                        tick for state in stretch for peer, tick, _ in state.rx if peer == place
+                        tick
+                        for state in stretch
+                        for peer, tick, _ in state.rx
+                        if peer == first_unheard
                     ]
         newest = max(tick for tick in newest_ticks if tick <= start[-1].tick)
         last = max((tick for tick in there if tick <= newest), default=-1)

@@ -82,13 +82,13 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
     for name, states in session.published.states.items():
         setup, theta = session.scenario.setup(name), session.scenario.arms[name].theta
         limited = find_limited_ticks(session.scenario, name, states)
-        place = 0
+        first_row = 0
         for (_, resting), group in groupby(
             states, key=lambda at: (at.boot, at.mode in RESTING)
         ):
             rows = list(group)
-            of = slice(place, place + len(rows))
-            place = of.stop
+            of = slice(first_row, first_row + len(rows))
+            first_row = of.stop
             if resting:
                 q, qd = (
                     np.array([getattr(state, key) for state in rows]) for key in ("q", "qd")

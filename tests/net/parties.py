@@ -26,12 +26,12 @@ CLOCK = ManualClock().identity()
 def answer_info(name: str, boot: int, **facts: object) -> Info:
     """Returns a member's answer about its identity; `facts` override."""
     recorder = name == topics.RECORDER
-    own = {
+    info_facts = {
         "scenario_sha256": "" if recorder else HASH,
         "scenario": "" if recorder else "the scenario",
     }
-    own |= {"host": "h", "clock": CLOCK, "fingerprint": "f"}
-    return Info(**{"member": name, "boot": boot, **own, **facts})
+    info_facts |= {"host": "h", "clock": CLOCK, "fingerprint": "f"}
+    return Info(**{"member": name, "boot": boot, **info_facts, **facts})
 
 
 class Elsewhere(ManualClock):

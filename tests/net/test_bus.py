@@ -18,9 +18,9 @@ from .waiting import drained, query_once, received, until
     params=[pytest.param(name, marks=[pytest.mark.long] * (name == "tls")) for name in NETWORKS]
 )
 def network(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Network]:
-    made = NETWORKS[request.param](tmp_path)
-    yield made
-    made.close()
+    member_network = NETWORKS[request.param](tmp_path)
+    yield member_network
+    member_network.close()
 
 
 @pytest.fixture
@@ -320,7 +320,7 @@ def test_leaving_twice_is_leaving_once(pair: tuple[Bus, Bus]) -> None:
 
 
 def test_members_of_two_networks_never_meet() -> None:
-    one, other = LocalNetwork().join(), LocalNetwork().join()
+    first, other = LocalNetwork().join(), LocalNetwork().join()
     inbox = other.inbox("**")
-    one.publisher("t/a")(b"1")
+    first.publisher("t/a")(b"1")
     assert inbox.poll() is None

@@ -254,8 +254,8 @@ def test_sessions_keep_free_ports() -> None:
     """So that `trilat set` and `trilat ping` find the session without its ports."""
     sites = ("a", "b", "c")
     places = list(default_endpoints("endpoints-test", sites).values())
-    with reserve_session_endpoints("endpoints-test", sites) as own:
-        assert own == places
+    with reserve_session_endpoints("endpoints-test", sites) as reserved:
+        assert reserved == places
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port(places[1])))
         taken.listen()
@@ -313,9 +313,9 @@ def announced(network: LocalNetwork, key: str) -> Bus:
 
 def test_routers_report_members_in_every_session() -> None:
     network = LocalNetwork()
-    there = announced(network, "trilat/one/m1/alive/1")
+    other_token = announced(network, "trilat/one/m1/alive/1")
     announced(network, "other/one/m1/alive/1")
-    clock = Played(lambda: announced(network, "trilat/two/s/alive/2"), there.close)
+    clock = Played(lambda: announced(network, "trilat/two/s/alive/2"), other_token.close)
     assert routed(clock, network) == [
         "session one: m1 is here",
         "session two: s is here",
@@ -362,7 +362,7 @@ def test_a_router_stays_until_all_members_have_left() -> None:
 
 def test_without_a_time_it_stays_for_ever() -> None:
     network = LocalNetwork()
-    there = announced(network, "trilat/t/m1/alive/1")
-    clock = Played(there.close, rest=1000)
+    other_token = announced(network, "trilat/t/m1/alive/1")
+    clock = Played(other_token.close, rest=1000)
     routed(clock, network)
     assert clock.over

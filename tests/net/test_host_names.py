@@ -95,8 +95,10 @@ COMMANDS = [
 @pytest.mark.long
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda text: text.partition(f" {UNKNOWN}")[0])
 def test_every_command_names_its_unresolvable_host(command: str, tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "trilat_net", *command.split()]
-    process = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    command_line = [sys.executable, "-m", "trilat_net", *command.split()]
+    process = subprocess.run(
+        command_line, cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
     assert process.returncode in (1, 2)  # 1: the examination of `doctor` found a failure
     assert "nohost.invalid" in process.stdout + process.stderr
     assert "resol" in process.stdout + process.stderr

@@ -55,16 +55,16 @@ ALL = (*SITES, RECORDER, OPERATOR, ROUTER, BRIDGE)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("deployment") / "keys"
-    create_keys(made, ALL, ["192.0.2.1", "robot.example"], 30)
-    return made
+    keys_folder = tmp_path_factory.mktemp("deployment") / "keys"
+    create_keys(keys_folder, ALL, ["192.0.2.1", "robot.example"], 30)
+    return keys_folder
 
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("others") / "keys"
-    create_keys(made, ALL, [], 30)
-    return made
+    keys_folder = tmp_path_factory.mktemp("others") / "keys"
+    create_keys(keys_folder, ALL, [], 30)
+    return keys_folder
 
 
 def lawless(keys: MemberKeys) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Meeting:
         self._places, self._mode = (places[2:], "client") if routed else (places[:2], "peer")
         if routed:
             self.members.append(ZenohBus(places[2:], mode="router", settings=self._own(ROUTER)))
-        listens = [[], []] if routed else [[place] for place in places[:2]]
+        listens = [[], []] if routed else [[endpoint] for endpoint in places[:2]]
         self.m1 = self._enter(listens[0], places[2:] if routed else [], self._own("m1"))
         self.m2 = self._enter(listens[1], places[2:] if routed else places[:1], self._own("m2"))
 
@@ -109,9 +109,9 @@ class Meeting:
     params=[False, pytest.param(True, marks=pytest.mark.long)], ids=["peers", "router"]
 )
 def meeting(request: pytest.FixtureRequest, folder: Path) -> Iterator[Meeting]:
-    made = Meeting(folder, routed=request.param)
-    yield made
-    made.close()
+    key_meeting = Meeting(folder, routed=request.param)
+    yield key_meeting
+    key_meeting.close()
 
 
 def key(member: str, channel: str) -> str:
@@ -457,7 +457,7 @@ def test_names_that_look_alike_are_refused(name: str, tmp_path: Path) -> None:
 
 def test_names_of_ascii_letters_are_taken(tmp_path: Path) -> None:
     names = ["m1", "Robot-2", "arm_3", "9"]
-    assert [made.name for made in create_keys(tmp_path / "keys", names)] == names
+    assert [created.name for created in create_keys(tmp_path / "keys", names)] == names
     for name in (*names, "paper.2"):
         assert check_session_name(name) == name
 
@@ -479,14 +479,14 @@ def make_ending_keys(
 @contextmanager
 def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus, ZenohBus]]:
     """Connects the sites m1, which listens, and s."""
-    (place,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
+    (first_endpoint,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
     settings = {
         member: read_member_keys(folder / member, stops=stops).settings
         for member in ("m1", "s")
     }
     with (
-        closing(ZenohBus([place], settings=settings["m1"])) as site,
-        closing(ZenohBus([], [place], settings=settings["s"])) as peer,
+        closing(ZenohBus([first_endpoint], settings=settings["m1"])) as site,
+        closing(ZenohBus([], [first_endpoint], settings=settings["s"])) as peer,
     ):
         yield site, peer
 

@@ -38,9 +38,9 @@ def test_true_offset_and_drift_stay_inside_bounds(
     """Delays as unequal as possible, pauses, ways without messages, and a silence afterwards."""
     estimator = OffsetEstimator()
     now_ns = latest_ns = 0
-    for pause_ns, there, delay_ns in crossings:
+    for pause_ns, there_ns, delay_ns in crossings:
         now_ns += pause_ns
-        if there:
+        if there_ns:
             estimator.add(ceiling(other, now_ns, delay_ns), None)
         else:
             estimator.add(None, floor(other, now_ns, delay_ns))
@@ -48,7 +48,7 @@ def test_true_offset_and_drift_stay_inside_bounds(
     estimate = estimator.estimate(latest_ns)
     assert estimator.broken == 0
     if estimate is None:
-        assert len({there for _, there, _ in crossings}) == 1
+        assert len({there_ns for _, there_ns, _ in crossings}) == 1
         return
     for later_ns in (0, silence_ns):
         at_ns = latest_ns + later_ns
@@ -126,8 +126,8 @@ def test_bad_minutes_do_not_move_the_drift() -> None:
     other, rnd, estimator = Other(S, 50_000), random.Random(2), OffsetEstimator()
     for n in range(40):
         bad = 15 <= n < 25
-        there = queueing(5_000, 5_000) if bad else queueing(100, 50)
-        estimator.add(*second(other, n * S, there, queueing(100, 50), rnd))
+        way_back = queueing(5_000, 5_000) if bad else queueing(100, 50)
+        estimator.add(*second(other, n * S, way_back, queueing(100, 50), rnd))
     estimate = estimator.estimate(40 * S)
     assert estimate is not None
     assert estimate.drift == pytest.approx(50_000, abs=1_000)

@@ -200,16 +200,16 @@ def test_answers_count_for_their_own_question() -> None:
     clock, network = ManualClock(S), LocalNetwork()
     questions = network.join().query_inbox("t/a")
     asking = RepeatedQuery(network.join(), clock, "t/*")
-    asked = []
+    asked_ticks = []
     for _ in range(3):
         asking.repeat(0)
-        asked.append(clock.monotonic_ns())
+        asked_ticks.append(clock.monotonic_ns())
         clock.sleep_until(clock.monotonic_ns() + S)
-    waiting = [questions.poll() for _ in asked]
+    waiting = [questions.poll() for _ in asked_ticks]
     for n in (2, 0, 1):
         waiting[n].reply(bytes([n]))
-    answers = [asking.poll() for _ in asked]
-    assert sorted(answers) == [(asked[n], "t/a", bytes([n])) for n in range(3)]
+    answers = [asking.poll() for _ in asked_ticks]
+    assert sorted(answers) == [(asked_ticks[n], "t/a", bytes([n])) for n in range(3)]
     assert asking.poll() is None
 
 

@@ -252,8 +252,8 @@ def opened(mode: ZenohMode, place: str) -> Any:
 
 @pytest.fixture
 def wire() -> Iterator[Wire]:
-    with closing(Wire(*find_free_endpoints(1))) as made:
-        yield made
+    with closing(Wire(*find_free_endpoints(1))) as open_wire:
+        yield open_wire
 
 
 SENT = Attachment(1, 5, b"s" * 16)
@@ -293,8 +293,8 @@ def test_raising_messages_are_refused_without_effect(wire: Wire) -> None:
 
 def test_mismatched_publishers_are_named_at_once(wire: Wire) -> None:
     wire.graph.subscribe("a", STRING, lambda *_, **__: None)
-    place = Ros2Member(3, str(wire.stranger.zid()), "", "talker")
-    token = place.endpoint_token(
+    ros_member = Ros2Member(3, str(wire.stranger.zid()), "", "talker")
+    token = ros_member.endpoint_token(
         1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()
     )
     with_token = wire.stranger.liveliness().declare_token(token)

@@ -24,9 +24,9 @@ RECORDER = topics.RECORDER
 
 
 def party(*names: str) -> Party:
-    made = Party(SITES)
-    made.start(*names)
-    return made
+    session_party = Party(SITES)
+    session_party.start(*names)
+    return session_party
 
 
 @st.composite
@@ -354,9 +354,9 @@ GARBAGE.append(bytes(70_000))
 @pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])
 def test_garbage_delays_no_session(name: str) -> None:
     session = party(*SITES)
-    asked = session.stranger.query_inbox(topics.key(SESSION, name, topics.INFO))
+    answers = session.stranger.query_inbox(topics.key(SESSION, name, topics.INFO))
     for _ in range(30):
-        query = asked.poll()
+        query = answers.poll()
         for payload in GARBAGE:
             session.say(name, payload)
             if query is not None:
@@ -412,9 +412,9 @@ def test_unannounced_events_change_nothing(event: Event) -> None:
 
 def test_answers_under_foreign_keys_do_not_count() -> None:
     session = party("m1", "m2")
-    asked = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
+    answers = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
     for _ in range(50):
-        while (question := asked.poll()) is not None:
+        while (question := answers.poll()) is not None:
             question.reply(encode(answer_info("s", 1)))
         session.round()
     assert session.members["m1"].joining.membership.list_missing() == ["s"]
@@ -422,10 +422,10 @@ def test_answers_under_foreign_keys_do_not_count() -> None:
 
 def test_answers_of_other_versions_enter_the_error() -> None:
     session = party("m1", "m2")
-    asked = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
+    answers = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
     newer: Info = answer_info("s", 1, v=VERSION + 1)
     for _ in range(50):
-        while (question := asked.poll()) is not None:
+        while (question := answers.poll()) is not None:
             question.reply(encode(newer))
         session.round()
     assert session.members["m1"].joining.membership.list_missing() == ["s"]

@@ -69,9 +69,9 @@ def test_strangers_without_certificate_stay_outside(tmp_path: Path) -> None:
     )
     router = ZenohBus([endpoint], mode="router", settings=ours.own)
     try:
-        for own in (theirs.own, None):
+        for own_file in (theirs.own, None):
             with pytest.raises(RouterSilent):
-                ZenohBus([], [endpoint], "client", own)
+                ZenohBus([], [endpoint], "client", own_file)
         ZenohBus([], [endpoint], "client", ours.own).close()
     finally:
         router.close()

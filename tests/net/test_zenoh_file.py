@@ -97,7 +97,7 @@ def test_accepted_files_keep_the_sessions_needs(data: st.DataObject) -> None:
 
 
 def test_unneeded_settings_are_kept() -> None:
-    own = checked(
+    checked_file = checked(
         {
             "transport": {
                 "link": {"tx": {"lease": 9_000, "keep_alive": 3}, "protocols": ["tls"]},
@@ -108,7 +108,7 @@ def test_unneeded_settings_are_kept() -> None:
             "access_control": {"enabled": False},
         }
     ).settings
-    settings = make_zenoh_config(["tcp/a:1"], ["tcp/b:1"], "peer", own)
+    settings = make_zenoh_config(["tcp/a:1"], ["tcp/b:1"], "peer", checked_file)
     assert look_up(settings, "transport/link/tx/lease") == 9_000
     assert look_up(settings, "transport/link/protocols") == ["tls"]
     assert look_up(settings, "transport/unicast/open_timeout") == 700

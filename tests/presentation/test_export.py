@@ -80,9 +80,9 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
         with (folder / f"{name}.csv").open(encoding="utf-8", newline="") as stream:
             heads, *rows = csv.reader(stream)
         assert heads == list(columns)
-        for place, values in enumerate(columns.values()):
+        for column_index, values in enumerate(columns.values()):
             for row, wanted in zip(rows, values, strict=True):
-                text = row[place]
+                text = row[column_index]
                 read = (
                     text
                     if isinstance(wanted, str)
@@ -108,19 +108,19 @@ def test_parquet_read_by_polars(tmp_path: Path) -> None:
 
 def test_npz_read_by_numpy(tmp_path: Path) -> None:
     arrays = np.load(exported("npz", tmp_path))  # which refuses pickles
-    found = set()
+    seen_columns = set()
     for name, columns in expected().items():
         site, _, kind = name.partition("_")
-        place = site if kind in ("", "state") else f"{site}/{kind}"
+        table_name = site if kind in ("", "state") else f"{site}/{kind}"
         for column, values in columns.items():
-            found.add(f"{place}/{column}")
-            read = arrays[f"{place}/{column}"].tolist()
+            seen_columns.add(f"{table_name}/{column}")
+            read = arrays[f"{table_name}/{column}"].tolist()
             for value, wanted in zip(read, values, strict=True):
                 if None in values:  # NaN needs a float
                     assert np.isnan(value) if wanted is None else value == wanted
                 else:
                     assert same(value, wanted)
-    assert set(arrays) == found | {"about_json", "scenario_toml"}
+    assert set(arrays) == seen_columns | {"about_json", "scenario_toml"}
     assert parse_scenario(str(arrays["scenario_toml"])) == log().scenario
     assert json.loads(str(arrays["about_json"]))["session"] == log().session
 

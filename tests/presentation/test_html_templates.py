@@ -145,7 +145,8 @@ def fill(value: Any, text: str) -> Any:
         return type(value)(fill(item, text) for item in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
-            one.name: fill(getattr(value, one.name), text) for one in dataclasses.fields(value)
+            data_field.name: fill(getattr(value, data_field.name), text)
+            for data_field in dataclasses.fields(value)
         }
         return dataclasses.replace(value, **fields)
     return value

@@ -28,9 +28,9 @@ def test_changes_and_modes_have_their_origin() -> None:
     assert any("(command, applied at tick 500 of a)." in line for line in texts)
     assert any("(scenario)." in line for line in texts)
     html = render_timeline(log, summarise_run(log))
-    shown, folded = html.split("<details>")
-    assert shown.count("<li>") == MAX_SHOWN
-    assert shown.count("<li>") + folded.count("<li>") == len(texts)
+    visible, folded = html.split("<details>")
+    assert visible.count("<li>") == MAX_SHOWN
+    assert visible.count("<li>") + folded.count("<li>") == len(texts)
     assert [f"<b>{number}</b> " in html for number in (1, 2, 3)] == [True] * 3
 
 

@@ -109,11 +109,11 @@ def test_names_unsuitable_for_rerun_are_replaced(
 
 
 def test_browsers_get_an_address(files: dict[str, Path]) -> None:
-    rerun, (told,) = run_viewer([files["live"]], ViewerOptions(web=True))
+    rerun, (message,) = run_viewer([files["live"]], ViewerOptions(web=True))
     page = rerun.command[rerun.command.index("--web-viewer-port") + 1]
     port = rerun.command[rerun.command.index("--port") + 1]
     assert "--serve-web" in rerun.command
-    assert told.startswith(
+    assert message.startswith(
         f"open http://127.0.0.1:{page}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
     )
 
@@ -165,8 +165,8 @@ def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], Pl
 
 
 def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
-    for channels, shown in boards(files).values():
-        for page in shown.pages.values():
+    for channels, panels in boards(files).values():
+        for page in panels.pages.values():
             for plot in (plot for row in page for plot in row):
                 for entity, names, visible in plot.curves:
                     topic = entity if entity in channels else entity.rpartition("/")[0]
@@ -176,15 +176,15 @@ def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
 
 
 def test_sites_are_columns_and_quantities_rows(files: dict[str, Path]) -> None:
-    channels, shown = boards(files)["live"]
-    assert list(shown.pages) == ["Motion", "Speeds, estimates", "Links, timing"]
-    for page in shown.pages.values():
+    channels, panels = boards(files)["live"]
+    assert list(panels.pages) == ["Motion", "Speeds, estimates", "Links, timing"]
+    for page in panels.pages.values():
         for row in page:
             assert [plot.title.partition(":")[0] for plot in row] == list(SCENARIO.names)
-    first = shown.pages["Motion"][0][0]
+    first = panels.pages["Motion"][0][0]
     assert first.title == "m: joint angles and reference (rad)"
     assert first.curves[0].names == ("m_q1", "m_q2", "m_q1_ref", "m_q2_ref")
-    assert shown.lines == "/viz/log"
+    assert panels.lines == "/viz/log"
     assert {"/viz/log", "/viz/events"} <= set(channels)
 
 

@@ -137,14 +137,14 @@ def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
 def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
-    path, told = tmp_path / "bag.mcap", list[int]()
-    export_ros2(opened(recorded("paper")), path, told.append)
+    path, log_times = tmp_path / "bag.mcap", list[int]()
+    export_ros2(opened(recorded("paper")), path, log_times.append)
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages(log_time_order=False))
     times = [message.log_time for _, _, message in messages]
     assert times == sorted(times)
     topics = [channel.topic for _, channel, _ in messages]
-    assert sum(topic.endswith("/joint_states") for topic in topics) == sum(told) == 3 * 120
+    assert sum(topic.endswith("/joint_states") for topic in topics) == sum(log_times) == 3 * 120
     assert {"/paper/m1/link_age", "/paper/events", "/paper/log", "/tf", "/diagnostics"} <= set(
         topics
     )

@@ -94,16 +94,16 @@ class Memory:
                 question.reply(payload)
 
     def past(self, wanted: BackfillRequest) -> Backfill:
-        made = self.made[wanted.channel]
-        first = max(wanted.first, min(self.oldest[wanted.channel], len(made)))
+        numbers_made = self.made[wanted.channel]
+        first = max(wanted.first, min(self.oldest[wanted.channel], len(numbers_made)))
         last = min(wanted.last, first + self.chunk - 1)
         return Backfill(
             member=self.name,
             boot=BOOTS[self.name],
             channel=wanted.channel,
             first=first,
-            payloads=list(made[first : last + 1]),
-            made=len(made),
+            payloads=list(numbers_made[first : last + 1]),
+            made=len(numbers_made),
         )
 
 

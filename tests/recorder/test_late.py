@@ -99,11 +99,11 @@ def test_recorders_take_over_from_ended_ones(tmp_path: Path, ahead_ns: int) -> N
     later = tmp_path / "later.mcap"
 
     def second(clock: RelayClock) -> str | None:
-        own = session._own("later", clock)
+        late_recorder = session._own("later", clock)
         said = session.said.append
         recorder = Recorder(
             session.network.join(),
-            own,
+            late_recorder,
             REAL,
             99,
             LogStorage(later),

@@ -351,10 +351,14 @@ def test_gravity_along_an_axis_is_a_direction() -> None:
 
 def test_a_sites_own_file_replaces_groups() -> None:
     """No key of [arm] holds for a site that names a file: tip and drives belong to the arm of the group."""
-    own = {"arm": {"urdf": "arm7.urdf", "tip": "link6"}, "control": {"Kp": 0.01, "Kd": 0.0}}
+    own_keys = {
+        "arm": {"urdf": "arm7.urdf", "tip": "link6"},
+        "control": {"Kp": 0.01, "Kd": 0.0},
+    }
     start = [0, 0, 0, -1.5, 0, 1.5]
     tables = six(
-        **{f"sites.s.{key}": value for key, value in own.items()}, **{"sites.s.q0_rad": start}
+        **{f"sites.s.{key}": value for key, value in own_keys.items()},
+        **{"sites.s.q0_rad": start},
     )
     assert tables.sites["s"].arm.armature_kg_m2 == (0.0,)
     assert tables.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))

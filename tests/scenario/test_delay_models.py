@@ -71,10 +71,10 @@ def test_links_are_described_in_few_words() -> None:
         "outages_s": [[1, 2.5]],
         "order": "in_order",
     }
-    words = link(
+    description = link(
         {"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}
     ).describe()
-    assert words == (
+    assert description == (
         "gamma 40 +- 10 ms, loss 5 % in bursts of 8, duplicates 1 %, cut 1-2.5 s, in order, play-out 80 ms"
     )
     assert link({"model": "none"}).describe() == "no delay"

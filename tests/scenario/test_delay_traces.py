@@ -98,14 +98,14 @@ def test_invalid_traces_are_refused_with_place(
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "latin.csv").write_bytes(b"t_s,delay_ms # \xe4\n0,5\n")
     (tmp_path / "long.csv").write_text("0," + "5" * 200_000, encoding="utf-8")
-    for name, words in (
+    for name, reason in (
         ("none.csv", "cannot be read: No such file"),
         ("", "cannot be read: the path is a folder, not a file"),
         ("latin.csv", "can't decode"),
         ("long.csv", "field larger than field limit"),
         ("a\0b.csv", "null byte"),
     ):
-        with pytest.raises(ScenarioError, match=words):
+        with pytest.raises(ScenarioError, match=reason):
             read_trace(tmp_path / name, "m1->s")
 
 

@@ -16,8 +16,10 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 def compare_texts(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
     return {
-        str(one): one.values
-        for one in compare_scenarios([load_scenario(name, sets) for name, sets in scenarios])
+        str(difference): difference.values
+        for difference in compare_scenarios(
+            [load_scenario(name, sets) for name, sets in scenarios]
+        )
     }
 
 

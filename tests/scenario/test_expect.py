@@ -166,9 +166,9 @@ def test_windows_may_name_joints() -> None:
 
     named = windows(q_elbow_rad=[0.0, 1.0], push_wrist_1_mean_nm=[-1.0, 1.0])
     assert named == windows(q3_rad=[0.0, 1.0], push4_mean_nm=[-1.0, 1.0])
-    for keys, words in (
+    for keys, reason in (
         ({"q_elbo_rad": [0, 1]}, r"expect\.windows\[0\]\.q_elbo_rad: unknown key"),
         ({"q_elbow_rad": [0, 1], "q3_rad": [0, 1]}, "repeats q3_rad"),
     ):
-        with pytest.raises(ScenarioError, match=words):
+        with pytest.raises(ScenarioError, match=reason):
             windows(**keys)

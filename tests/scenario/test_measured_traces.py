@@ -79,8 +79,8 @@ def test_pings_that_restart_counting_continue(tmp_path: Path) -> None:
 def test_cicv5g_tables_make_a_link(tmp_path: Path) -> None:
     path = tmp_path / "drive.txt"
     path.write_text(CICV5G)
-    found = import_trace(path, "csv", way="half")
-    assert found.points == ((0.0, 11.0), (0.054, 16.5), (0.109, 5250.0))
+    trace_of_link = import_trace(path, "csv", way="half")
+    assert trace_of_link.points == ((0.0, 11.0), (0.054, 16.5), (0.109, 5250.0))
     whole = import_trace(path, "csv")
     assert whole.points == ((0.0, 22.0), (0.054, 33.0), (0.109, math.inf))
     assert whole.too_long == 1

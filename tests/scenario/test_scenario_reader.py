@@ -411,12 +411,12 @@ def test_files_are_read_by_path(tmp_path: Path) -> None:
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     latin = tmp_path / "latin.toml"
     latin.write_bytes("title = 'Stärke'".encode("latin-1"))
-    for path, words in (
+    for path, reason in (
         (tmp_path / "none.toml", "No such file"),
         (tmp_path, "is a folder"),
         (latin, "not UTF-8"),
     ):
-        with pytest.raises(ScenarioError, match=words) as error:
+        with pytest.raises(ScenarioError, match=reason) as error:
             load_scenario(path)
         assert str(path) in str(error.value)
 

@@ -181,7 +181,9 @@ class Session:
 
     def lose_token(self, name: str) -> None:
         for member in self.network.members:
-            for token in [one for one in member._tokens if f"/{name}/alive/" in one]:
+            for token in [
+                live_token for live_token in member._tokens if f"/{name}/alive/" in live_token
+            ]:
                 member._tokens.remove(token)
                 member._notify(token, False)
 

@@ -50,12 +50,14 @@ def parent(pid: int) -> int:
 
 
 def test_processes_run_their_words(starter: ProcessStarter, tmp_path: Path) -> None:
-    shown = wait_for_end(starter, starter.start("show", ["scenario", "show", "paper"]))
+    show_process = wait_for_end(starter, starter.start("show", ["scenario", "show", "paper"]))
     refused = wait_for_end(
         starter, starter.start("site", ["site", "m9", "--scenario", "paper"])
     )
-    assert (shown.code, shown.problem()) == (0, None)
-    assert shown.output.read_text() == trilat("scenario", "show", "paper", cwd=tmp_path).out
+    assert (show_process.code, show_process.problem()) == (0, None)
+    assert (
+        show_process.output.read_text() == trilat("scenario", "show", "paper", cwd=tmp_path).out
+    )
     assert refused.code == 2
     assert "site ended with code 2: " in str(refused.problem())
     assert "m9" in str(refused.problem())

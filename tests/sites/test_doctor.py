@@ -43,10 +43,10 @@ def test_a_failing_measurement_gives_its_reason(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("deployment") / "keys"
-    create_keys(made, MEMBERS, [], 30)
-    shutil.move(made / "authority", made.parent / "safe")
-    return made
+    keys_folder = tmp_path_factory.mktemp("deployment") / "keys"
+    create_keys(keys_folder, MEMBERS, [], 30)
+    shutil.move(keys_folder / "authority", keys_folder.parent / "safe")
+    return keys_folder
 
 
 class UnpunctualClock(ManualClock):
@@ -139,8 +139,8 @@ def test_endpoints_open_to_networks_are_reported() -> None:
     assert links(None, ["tcp/0.0.0.0:0"], [], insecure=True) == ["warn"]
     assert links(None, ["tcp/127.0.0.1:0"], []) == ["ok"]
     assert links(None, [], ["quic/127.0.0.1:1"]) == ["warn"]  # not tried
-    with socket.create_server(("127.0.0.1", 0)) as there:
-        assert links(None, [], [f"tcp/127.0.0.1:{there.getsockname()[1]}"]) == ["ok"]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        assert links(None, [], [f"tcp/127.0.0.1:{listener.getsockname()[1]}"]) == ["ok"]
 
 
 class OddClock(ManualClock):
@@ -178,7 +178,7 @@ def test_a_nearly_full_disk_is_reported(
         for finding in examine_room(tmp_path / "not" / "there")
         if finding.check == "disk"
     ]
-    assert [one.state for one in findings] == [state]
+    assert [found_item.state for found_item in findings] == [state]
 
 
 def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:

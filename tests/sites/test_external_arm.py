@@ -248,7 +248,7 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
     session, ends = session_of(
         tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
     )
-    told: list[tuple[bool, str]] = []
+    answers: list[tuple[bool, str]] = []
 
     def hold(bus: Bus, clock: RelayClock) -> None:
         with SwitchClient(bus, clock, SESSION, "s") as switch:
@@ -262,7 +262,7 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
                     clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             switch.send(held=False)
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
-            told.extend(
+            answers.extend(
                 (one.accepted, one.text)
                 for one in reached(bus, clock).send_order(["s"], "enable")
             )
@@ -281,7 +281,7 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
         for event in log.events
     ]
     assert len([text for text in said if text]) == 3
-    assert told == [
+    assert answers == [
         (
             False,
             "the dead-man switch of s is not held; enable the site while the switch is held",
@@ -317,8 +317,8 @@ class Switch:
 
 
 def test_switches_hold_until_released_or_silent() -> None:
-    one = Switch()
-    switch, clock, ring, hear = one.switch, one.clock, one.ring, one.hear
+    dead_man = Switch()
+    switch, clock, ring, hear = dead_man.switch, dead_man.clock, dead_man.ring, dead_man.hear
     assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
     assert switch.pop_order(Mode.FAULT, LifeReason.START) == ""
     assert not hear(1, 0, site="m")
@@ -335,7 +335,7 @@ def test_switches_hold_until_released_or_silent() -> None:
     assert hear(2, 1)
     ring.receive(b"garbage")
     switch.poll()
-    assert one.dropped == {"stranger": 1, "old switch message": 1, "malformed": 1}
+    assert dead_man.dropped == {"stranger": 1, "old switch message": 1, "malformed": 1}
 
 
 @pytest.mark.parametrize("first", [1, 2])

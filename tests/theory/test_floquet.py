@@ -129,7 +129,7 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
     shipped = load_scenario(name)
     sites = shipped.names
     if control["law"] == "adaptive":
-        control["theta_hat0"] = [float(one) for one in shipped.arms[sites[0]].theta]
+        control["theta_hat0"] = [float(parameter) for parameter in shipped.arms[sites[0]].theta]
     rates = rng.choice([40, 50, 60, 80, 100, 150, 200], len(sites)).tolist()
     mean_ms = float(rng.integers(0, 400))
     sine = {"model": "sine", "amplitude_ms": round(mean_ms * rng.uniform(0.3, 1.0), 1)}

@@ -45,9 +45,9 @@ def test_dips_between_grid_points_are_found(at_hz: float, width: float) -> None:
 
 
 def test_ranges_below_levels_have_exact_edges() -> None:
-    found = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
+    curve_minima = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
     expected = [(1 / 6, 5 / 6), (7 / 6, 11 / 6)]
-    np.testing.assert_allclose(found.below, np.array(expected), rtol=1e-6)
+    np.testing.assert_allclose(curve_minima.below, np.array(expected), rtol=1e-6)
     minima = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
     np.testing.assert_allclose(minima.below, [(0.6, 1.0)], rtol=1e-6)
     ended = find_minima(np.sin, HZ * np.linspace(0.1, 0.9, 200), level=0.0)

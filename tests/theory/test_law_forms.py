@@ -211,10 +211,11 @@ def test_shared_authority_has_its_springs_roots() -> None:
     ]
 
     def users(s: complex) -> complex:
-        own = s * s + d * s
+        free_dynamics = s * s + d * s
         pulls = K_a * alpha[0, 1], K_a * alpha[1, 0]
         return complex(
-            (own + pulls[0]) * (own + pulls[1]) - pulls[0] * pulls[1] * np.exp(-2.0 * s * T)
+            (free_dynamics + pulls[0]) * (free_dynamics + pulls[1])
+            - pulls[0] * pulls[1] * np.exp(-2.0 * s * T)
         )
 
     assert sum(solves(users, s) for s in roots) >= 3

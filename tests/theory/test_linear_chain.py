@@ -277,13 +277,13 @@ def test_joints_answer_sinusoids_by_their_admittance() -> None:
     points = np.zeros((len(t_s), 7))
     points[:, 0], points[:, 3] = t_s, amplitude_nm * np.sin(w_rad_s * t_s)
     hands = [{"kind": "recorded", "points": points.tolist()}]
-    made = follow(
+    motion_of_joints = follow(
         six("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario, 18 * rate_hz
     )
-    late = np.arange(round(settled_s * rate_hz), len(made))
+    late = np.arange(round(settled_s * rate_hz), len(motion_of_joints))
     turned = w_rad_s * (late + 1) / rate_hz
     columns = np.column_stack([np.sin(turned), np.cos(turned), np.ones_like(turned), turned])
-    sine, cosine, *_ = np.linalg.lstsq(columns, made[late], rcond=None)[0]
+    sine, cosine, *_ = np.linalg.lstsq(columns, motion_of_joints[late], rcond=None)[0]
     admittance = 1j * w_rad_s * (sine + 1j * cosine) / amplitude_nm
     assert np.abs(admittance - Y).max() <= 0.01 * np.abs(Y).max()
 

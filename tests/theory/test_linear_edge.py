@@ -175,9 +175,9 @@ def damped(d: float) -> Scenario:
 
 
 def test_the_real_part_is_that_of_the_analysis() -> None:
-    found, _, remarks = compute_growth_column([damped(d) for d in D], "control.d", D)
+    growth_rates, _, remarks = compute_growth_column([damped(d) for d in D], "control.d", D)
     assert remarks == []
-    for d, growth in zip(D, found, strict=True):
+    for d, growth in zip(D, growth_rates, strict=True):
         root = analyse_linear_loop(
             damped(d), pose=(1.0 / 15.0, 7.0 / 30.0)
         ).continuous.rightmost
@@ -215,12 +215,12 @@ def test_the_scheme_decides_the_loop() -> None:
 
 def test_nonlinear_loops_are_reported_as_unknown() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
-    found, edges, remarks = compute_growth_column(
+    growth_rates, edges, remarks = compute_growth_column(
         [unknown, damped(3.0)], "control.d", (2.9, 3.0)
     )
     assert edges == {}
-    assert np.isnan(found[0])
-    assert found[1] < 0.0
+    assert np.isnan(growth_rates[0])
+    assert growth_rates[1] < 0.0
     assert len(remarks) == 1
     assert remarks[0].startswith("no linear analysis: ")
     crossings, remark = find_root_crossings(unknown, "control.d", 0.3, 3.0)

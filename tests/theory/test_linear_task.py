@@ -202,7 +202,8 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     start = np.array([off.get(name, 0.0) for name in names])
     X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // len(late))])
     learnt, torques = (
-        [n for n, one in enumerate(names) if kind in one] for kind in (".gravity", ".tau")
+        [n for n, state_name in enumerate(names) if kind in state_name]
+        for kind in (".gravity", ".tau")
     )
     X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
     X[torques] = (whole @ X)[torques]

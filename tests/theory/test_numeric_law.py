@@ -96,9 +96,9 @@ def test_unlinearised_features_are_refused() -> None:
 
 def test_a_certificate_runs_no_code_from_outside() -> None:
     log = tn.simulate("two_sites", {"control.law": PD}, duration_s=0.1)
-    found = tn.certify(log).roots
-    assert found is not None
-    assert "known by its code only" in found.text
+    loop_roots = tn.certify(log).roots
+    assert loop_roots is not None
+    assert "known by its code only" in loop_roots.text
 
 
 @pytest.mark.long

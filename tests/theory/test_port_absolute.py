@@ -27,8 +27,8 @@ def draw_networks(seed: int, ports: int, count: int = 40) -> Complex:
     rng = np.random.default_rng(seed)
     Y = rng.normal(size=(count, ports, ports)) + 1j * rng.normal(size=(count, ports, ports))
     Y *= 10.0 ** rng.uniform(-1.0, 1.0, size=(count, 1, ports)) * rng.uniform(0.1, 0.6)
-    own = np.arange(ports)
-    Y[:, own, own] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(
+    own_ports = np.arange(ports)
+    Y[:, own_ports, own_ports] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(
         size=(count, ports)
     )
     return np.asarray(Y, dtype=np.complex128)
@@ -95,7 +95,7 @@ def destabilised(Y: Complex) -> NDArray[np.bool_]:
     """
     x = np.tan(np.linspace(-0.499 * np.pi, 0.499 * np.pi, 301))
     z1, z2 = (1j * part for part in np.meshgrid(x, x))
-    found = np.zeros(len(Y), dtype=bool)
+    is_destabilised = np.zeros(len(Y), dtype=bool)
     for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         for n, y in enumerate(Y[:, order][:, :, order]):
             a, b = 1.0 + y[0, 0] * z1, 1.0 + y[1, 1] * z2
@@ -105,8 +105,8 @@ def destabilised(Y: Complex) -> NDArray[np.bool_]:
                 - y[0, 2] * (y[2, 0] * z1 * b - y[2, 1] * z2 * y[1, 0] * z1)
                 + y[1, 2] * (y[2, 0] * z1 * y[0, 1] * z2 - y[2, 1] * z2 * a)
             )
-            found[n] |= bool((-(without / with_third).real > 0.0).any())
-    return found
+            is_destabilised[n] |= bool((-(without / with_third).real > 0.0).any())
+    return is_destabilised
 
 
 @settings(max_examples=4, deadline=None)

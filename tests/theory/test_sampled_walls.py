@@ -61,8 +61,8 @@ def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:
     """b > K h / 2 + B with b = 1 / (n'J D^-1 J'n) where the arm rests."""
     q1, q2 = find_equilibrium(windup(5000.0, B, b)).q[2]
     J = np.array([-np.sin(q1) - np.sin(q1 + q2), -np.sin(q1 + q2)])
-    own = b / float(J @ J)
-    bound = 2.0 * 1000.0 * (own - B)
+    damper_damping = b / float(J @ J)
+    bound = 2.0 * 1000.0 * (damper_damping - B)
     edge_found = edge(B, b)
     assert edge_found is None or edge_found.value > bound > 0.0
 
@@ -182,10 +182,10 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
     oldest = size - 12
     for n, (site, wall) in enumerate((("m", none), ("s", wall_stiffness(state, K)))):
         free, pushed = step[site]
-        own = slice(12 * n, 12 * n + 12)
-        A[own, own] = free + pushed @ (law - np.hstack([wall, none]))
+        own_rows = slice(12 * n, 12 * n + 12)
+        A[own_rows, own_rows] = free + pushed @ (law - np.hstack([wall, none]))
         peer = oldest + 6 * (1 - n)
-        A[own, peer : peer + 6] = pushed @ np.diag(STIFF)
+        A[own_rows, peer : peer + 6] = pushed @ np.diag(STIFF)
         A[24 + 6 * n : 30 + 6 * n, 12 * n : 12 * n + 6] = one
     A[36:, 24:-12] = np.eye(12 * (DELAY_TICKS - 1))
     return float(np.log(np.abs(np.linalg.eigvals(A)).max()) / H_S)

@@ -94,8 +94,8 @@ def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: 
 def test_the_papers_hands_hardly_move_joint_1() -> None:
     paper = load_scenario("paper")
     pushed, alone = (
-        sampled(made, np.arange(0.01, 20.01, 0.01))[..., :2]
-        for made in (paper, paper.without_hands())
+        sampled(scenario_run, np.arange(0.01, 20.01, 0.01))[..., :2]
+        for scenario_run in (paper, paper.without_hands())
     )
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
     assert np.abs(pushed - alone)[..., 0].max() <= 0.003

@@ -141,8 +141,8 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
         accelerations.append((s.qd - state[at.qd]) * rate_hz)
         rates = (s.theta_hat - state[at.estimate]) * rate_hz
         columns = {
-            name: buffers.record[place].copy()
-            for name, place in faster_site.layout.columns().items()
+            name: buffers.record[column].copy()
+            for name, column in faster_site.layout.columns().items()
         }
         records.append({**columns, "estimate": rates})
     return {**records[1], "qdd": 2.0 * accelerations[1] - accelerations[0]}
@@ -201,17 +201,17 @@ def test_rate_of_jacobian_is_its_derivative_along_motion(seed: int) -> None:
     site = build("posed", "s", "pd_d")
     rng = np.random.default_rng(seed)
     q, qd = rng.normal(0.0, 1.0, (2, len(site.q0)))
-    moved, here = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)
+    moved, placed_arm = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)
     assert isinstance(moved, PlacedChain)
-    assert isinstance(here, PlacedChain)
+    assert isinstance(placed_arm, PlacedChain)
     wanted = moved.pose_jacobian().imag / COMPLEX_STEP
-    assert np.abs(here.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (
+    assert np.abs(placed_arm.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (
         1.0 + np.abs(wanted).max()
     )
     R, turned = (
-        here.end_effector_orientation(),
+        placed_arm.end_effector_orientation(),
         moved.end_effector_orientation().imag / COMPLEX_STEP,
     )
     across = turned @ R.T
-    w = here.pose_jacobian()[3:] @ qd
+    w = placed_arm.pose_jacobian()[3:] @ qd
     assert np.array([across[2, 1], across[0, 2], across[1, 0]]) == pytest.approx(w, abs=1e-12)

@@ -162,13 +162,13 @@ def test_trials_margins_and_tuning_run_on_a_cluster(cluster: Cluster, tmp_path: 
             tmp_path / f"there{file}"
         ).read_bytes()
     batch = trilat_net.trials(quick(), [5, 2, 9])
-    here, there = (
+    here_results, cluster_results = (
         trilat_net.check(quick(), [5, 2, 9], **how) for how in ({"jobs": 1}, {"on": on[1]})
     )
-    assert [result.outcomes for result in here.results] == [
-        result.outcomes for result in there.results
+    assert [result.outcomes for result in here_results.results] == [
+        result.outcomes for result in cluster_results.results
     ]
-    assert len(batch) == len(there.results)
+    assert len(batch) == len(cluster_results.results)
 
 
 @pytest.mark.long

@@ -60,10 +60,10 @@ def test_gymnasiums_checker_finds_nothing(mode: str) -> None:
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized")
 @pytest.mark.parametrize("flat", [pytest.param(False, marks=pytest.mark.long), True])
 def test_gymnasiums_checker_renders_as_well(flat: bool) -> None:
-    made = gymnasium.make(
+    environment = gymnasium.make(
         ENV_ID, scenario="paper", set=BENT, duration_s=1, render_mode="rgb_array", flat=flat
     )
-    check_env(made.unwrapped)
+    check_env(environment.unwrapped)
 
 
 def test_an_episode_is_a_function_of_its_seed() -> None:

@@ -119,7 +119,7 @@ def test_a_candidate_is_the_mean_of_its_seeds(file: Path) -> None:
         ]
         alone = [measure_candidate(text, None) for text in texts]
         assert score == average_scores(alone)
-        assert score.error_rad == pytest.approx(np.mean([one.error_rad for one in alone]))
+        assert score.error_rad == pytest.approx(np.mean([single.error_rad for single in alone]))
         assert score.error_half_rad > 0.0
 
 

@@ -262,8 +262,12 @@ def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
         qd = now[..., 2:4]
         e = now[..., :2] - np.einsum("ij,jtn->itn", exact.alpha, then[..., :2])
         r = qd + exact.Lambda * e
-        apart = (exact.Kd * (qd[:, np.newaxis] - then[np.newaxis, ..., 2:4]) ** 2).sum(-1)
-        lost = (exact.Kp * r**2).sum((0, 2)) + 0.5 * np.einsum("ij,ijt->t", exact.alpha, apart)
+        disagreement = (exact.Kd * (qd[:, np.newaxis] - then[np.newaxis, ..., 2:4]) ** 2).sum(
+            -1
+        )
+        lost = (exact.Kp * r**2).sum((0, 2)) + 0.5 * np.einsum(
+            "ij,ijt->t", exact.alpha, disagreement
+        )
         pushed = np.stack([exact.hands(s) for s in times], axis=1)
         return lost, (r * pushed).sum((0, 2))
 
@@ -302,12 +306,15 @@ def check_six(duration_s: float) -> LogMetrics:
     assert unexplained(certificate.balance) <= BAR
     assert np.abs(certificate.balance.residual).max() <= BAR * certificate.balance.V.max()
     for site, energy in certificate.energies.items():
-        own = metrics.sites[site]
-        learnt = own["theta_energy_last_j"].value - own["theta_energy_first_j"].value
+        figures_of_site = metrics.sites[site]
+        learnt = (
+            figures_of_site["theta_energy_last_j"].value
+            - figures_of_site["theta_energy_first_j"].value
+        )
         assert learnt == pytest.approx(
             np.ptp(energy.parts.parameter[[0, -1]]) * np.sign(learnt), rel=1e-6
         )
-        assert own["unaccounted_j"].value <= 1e-6
+        assert figures_of_site["unaccounted_j"].value <= 1e-6
     return metrics
 
 
@@ -364,7 +371,7 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
     for site, name in (("s", "friction"), ("m2", "friction"), ("m2", "stops"), ("s", "walls")):
         energy = energies[site]
         kinds = {
-            kind: {key: one for key, one in getattr(energy, kind).items() if key != name}
+            kind: {key: course for key, course in getattr(energy, kind).items() if key != name}
             for kind in ("dissipation", "work")
         }
         lame = dataclasses.replace(energy, **kinds)
@@ -420,7 +427,7 @@ def test_the_balance_closes_under_jitter_and_limits() -> None:
 
 def test_damping_near_a_singular_pose_fails_a_premise() -> None:
     certificate = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
-    premise = next(one for one in certificate.premises if one.name == "singular poses")
+    premise = next(listed for listed in certificate.premises if listed.name == "singular poses")
     assert premise.holds is False
     assert "s from 0 s on" in premise.text
     assert certificate.balance is not None
@@ -447,7 +454,9 @@ def test_the_axis_of_one_arm_dissipates() -> None:
     assert taken[-1] > 1e-3
     assert np.diff(taken).min() >= -1e-15
     for site, energy in compute_site_energies(log).items():
-        terms = {name: one for name, one in energy.dissipation.items() if name != "open axes"}
+        terms = {
+            name: course for name, course in energy.dissipation.items() if name != "open axes"
+        }
         lame = dataclasses.replace(energy, dissipation=terms)
         if site == "s":
             assert np.abs(lame.residual).max() > 10 * np.abs(energy.residual).max()
@@ -455,7 +464,7 @@ def test_the_axis_of_one_arm_dissipates() -> None:
 
 def test_following_an_axis_free_at_peers_fails() -> None:
     certificate = judge(**{"sites.m.task.axes": ["x"]})
-    premise = next(one for one in certificate.premises if one.name == "axes")
+    premise = next(listed for listed in certificate.premises if listed.name == "axes")
     assert premise.holds is False
     assert "s follows m" in premise.text
 

@@ -154,9 +154,9 @@ def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> Non
         "store of s",
         "taken by s",
     }
-    given = next(curve for curve in energies.curves if curve.name == "given by m")
+    course_given = next(curve for curve in energies.curves if curve.name == "given by m")
     work = -(log["m"].tau[:-1] * np.diff(log["m"].q, axis=0)).sum()
-    assert given.energy_j[-1] == pytest.approx(work, rel=1e-9)
+    assert course_given.energy_j[-1] == pytest.approx(work, rel=1e-9)
     assert work > 0.05
 
 

@@ -22,7 +22,7 @@ def courses(
     """
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
-    found = []
+    courses_found = []
     blocks = max(len(log[site]) for site in log.sites) // BLOCK + late + 1
     for n in range(blocks):
         for site in log.sites:
@@ -34,9 +34,9 @@ def courses(
         if (
             course := running.compute_next({site: windows[site].newest for site in log.sites})
         ) is not None:
-            found.append(course)
+            courses_found.append(course)
     assert running.reason == ""
-    return found
+    return courses_found
 
 
 def joined(found: list[EnergyCourse]) -> EnergyCourse:

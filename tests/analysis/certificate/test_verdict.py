@@ -38,14 +38,14 @@ def simulate_free(**overrides: object) -> Log:
 
 
 def test_free_motion_is_covered() -> None:
-    found = certify(simulate_free())
-    assert found.verdict.finding is StabilityFinding.COVERED
-    assert found.verdict.text.startswith(
+    free_certificate = certify(simulate_free())
+    assert free_certificate.verdict.finding is StabilityFinding.COVERED
+    assert free_certificate.verdict.text.startswith(
         "covered by the theorem: V did not rise: 29.78 J at 0 s, 12"
     )
-    assert found.bounded_by_v
-    assert found.stability is Stability.OPEN
-    assert not found.passed
+    assert free_certificate.bounded_by_v
+    assert free_certificate.stability is Stability.OPEN
+    assert not free_certificate.passed
 
 
 def test_hands_are_named_and_excused() -> None:
@@ -164,11 +164,14 @@ d = { c = 1.0 }
 
 
 def test_two_closed_groups_are_refused_and_named() -> None:
-    found = certify(trilat_net.simulate(parse_scenario(FOUR)))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert "{a, b} and {c, d} follow nobody outside: beta is not unique" in found.verdict.text
-    assert found.groups == (("a", "b"), ("c", "d"))
-    assert found.balance is None
+    certificate_found = certify(trilat_net.simulate(parse_scenario(FOUR)))
+    assert certificate_found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert (
+        "{a, b} and {c, d} follow nobody outside: beta is not unique"
+        in certificate_found.verdict.text
+    )
+    assert certificate_found.groups == (("a", "b"), ("c", "d"))
+    assert certificate_found.balance is None
 
 
 def test_groups_made_by_a_change_are_refused() -> None:
@@ -337,8 +340,8 @@ def test_no_option_accepts_a_changed_log() -> None:
 @pytest.mark.parametrize("law", ["adaptive", "adaptive_box"])
 def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
     def scaled(r: dict) -> dict:
-        own = r["site"] == "m1" and r["tick"] >= 40
-        return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if own else r
+        is_own = r["site"] == "m1" and r["tick"] >= 40
+        return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if is_own else r
 
     data = recorded("free", {"duration_s": 2.0, "rate_hz": 100, "control.law": law})
     assert certify_bytes(data).verdict.finding is not StabilityFinding.BROKEN

@@ -115,12 +115,12 @@ def shaken() -> dict[str, object]:
 def test_linear_pair_has_its_closed_form_impedance() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
     log = simulated("two_sites", shaken())
-    (found,) = (
+    (measured_response,) = (
         response
         for response in compute_log_metrics(log).responses
         if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
-    assert found.ratio.frequency_hz == 1.0
+    assert measured_response.ratio.frequency_hz == 1.0
     s = 2j * math.pi
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
     M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
@@ -130,8 +130,8 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
         np.block([[own_impedance, far], [far, own_impedance]]), np.array([1.0, 0.0, 0.0, 0.0])
     )
     Z = 1.0 / (s * q[0])
-    assert found.ratio.gain == pytest.approx(abs(Z), rel=0.02)
-    assert found.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
+    assert measured_response.ratio.gain == pytest.approx(abs(Z), rel=0.02)
+    assert measured_response.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
 
 
 def test_a_still_hand_says_nothing_of_its_site() -> None:
@@ -168,19 +168,19 @@ MULTISINE = {
 def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
     """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
     log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
-    found = next(
+    measured_response = next(
         response
         for response in compute_log_metrics(log).responses
         if (response.at, response.joint) == ("m", 1)
     )
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
-    assert len(found.spectrum) == lines
-    for line in found.spectrum:
+    assert len(measured_response.spectrum) == lines
+    for line in measured_response.spectrum:
         Z = closed_form_impedance(line.frequency_hz, c2)
         assert line.gain == pytest.approx(abs(Z), rel=0.02 + 2.0 * line.error)
         assert line.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.02 + 3.0 * line.error)
         assert line.coherence > (0.998 if hand is MULTISINE else 0.92)
-    assert found.ratio in found.spectrum
-    assert [line.frequency_hz for line in found.spectrum] == sorted(
-        line.frequency_hz for line in found.spectrum
+    assert measured_response.ratio in measured_response.spectrum
+    assert [line.frequency_hz for line in measured_response.spectrum] == sorted(
+        line.frequency_hz for line in measured_response.spectrum
     )

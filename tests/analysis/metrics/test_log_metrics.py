@@ -315,15 +315,15 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
         return {"theta_hat": [*learnt, 7.0, 8.0]}
 
     measured = compute_log_metrics(pair(motion, seconds=6.0, more=LEARNS))
-    found, learnt = measured.sites["s"], measured.estimates["s"]
-    assert found["theta_error_first"].value == pytest.approx(13.0)
-    assert found["theta_energy_first_j"].value == pytest.approx(
+    figures_of_slave, learnt = measured.sites["s"], measured.estimates["s"]
+    assert figures_of_slave["theta_error_first"].value == pytest.approx(13.0)
+    assert figures_of_slave["theta_energy_first_j"].value == pytest.approx(
         0.5 * (9.0 + 16.0 + 144.0 / 2.0)
     )
     end_s = 6.0 - 1.0 / 200
     last = [3.0 + 0.1 * end_s, 4.0 + 0.2 * end_s, 12.0 - 0.2 * end_s]
-    assert found["theta_error_last"].value == pytest.approx(math.hypot(*last))
-    assert found["theta_slope_per_s"].value == pytest.approx(0.3)
+    assert figures_of_slave["theta_error_last"].value == pytest.approx(math.hypot(*last))
+    assert figures_of_slave["theta_slope_per_s"].value == pytest.approx(0.3)
     assert learnt.slope_per_s == pytest.approx([*rate, 0.0, 0.0], abs=1e-9)
     assert learnt.learnt == [True, True, True, False, False]
     assert learnt.theta == THETA

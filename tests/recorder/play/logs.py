@@ -31,8 +31,8 @@ def payloads(path: Path) -> dict[str, list[bytes]]:
 def session_payloads(path: Path) -> dict[str, list[bytes]]:
     """Returns the same for the messages of sites: by member and channel, as in "m1/state"."""
     return {
-        "/".join(topic.split("/")[3:]): found
-        for topic, found in payloads(path).items()
+        "/".join(topic.split("/")[3:]): payload_list
+        for topic, payload_list in payloads(path).items()
         if topic.startswith("/trilat/") and "/recorder/" not in topic
     }
 

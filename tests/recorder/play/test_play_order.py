@@ -31,17 +31,23 @@ def test_messages_come_once_in_time_order(given: Messages) -> None:
 def test_channels_play_in_order_of_their_numbers(given: Messages) -> None:
     order, _ = ordered(given)
     for channel in range(4):
-        own = [(given[place][2], place) for place in order if given[place][1] == channel]
-        assert own == sorted(own)
+        own_places = [
+            (given[message_index][2], message_index)
+            for message_index in order
+            if given[message_index][1] == channel
+        ]
+        assert own_places == sorted(own_places)
 
 
 @given(messages)
 def test_messages_are_early_only_before_later_numbers(given: Messages) -> None:
     order, due_ns = ordered(given)
-    for place, due in zip(order, due_ns, strict=True):
-        t_ns, channel, number = given[place]
+    for message_index, due in zip(order, due_ns, strict=True):
+        t_ns, channel, number = given[message_index]
         behind = [
-            t for n, (t, c, k) in enumerate(given) if c == channel and (k, n) >= (number, place)
+            t
+            for n, (t, c, k) in enumerate(given)
+            if c == channel and (k, n) >= (number, message_index)
         ]
         assert due == min(behind) <= t_ns
 

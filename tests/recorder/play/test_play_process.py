@@ -290,18 +290,18 @@ def test_progress_is_shown_twice_a_second(tmp_path: Path) -> None:
 
 def test_existing_sessions_are_refused() -> None:
     network, clock = LocalNetwork(), LookedAt()
-    visitor, there = network.join(), network.join()
-    there.respond(
+    visitor, playing = network.join(), network.join()
+    playing.respond(
         topics.key("other", "m1", topics.INFO),
         lambda _: encode(answer_info("m1", RECORDER_BOOT)),
     )
-    there.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
-    there.respond(
+    playing.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
+    playing.respond(
         topics.key(SESSION, "recorder", topics.INFO),
         lambda _: encode(answer_info("recorder", RECORDER_BOOT)),
     )
     refuse_running_session(visitor, clock, SESSION, lambda: False)
-    there.respond(
+    playing.respond(
         topics.key(SESSION, "m1", topics.INFO),
         lambda _: encode(answer_info("m1", RECORDER_BOOT)),
     )

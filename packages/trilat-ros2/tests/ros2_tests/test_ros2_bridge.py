@@ -314,20 +314,20 @@ class Listener:
 
 
 def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
-    found = {"world": (np.zeros(3), Rotation.identity())}
+    frames_by_name = {"world": (np.zeros(3), Rotation.identity())}
     for frame in frames:
         (at, turned), move, turn = (
-            found[frame.header.frame_id],
+            frames_by_name[frame.header.frame_id],
             frame.transform.translation,
             frame.transform.rotation,
         )
-        place = at + turned.apply([move.x, move.y, move.z])
-        found[frame.child_frame_id] = (
-            place,
+        position = at + turned.apply([move.x, move.y, move.z])
+        frames_by_name[frame.child_frame_id] = (
+            position,
             turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]),
         )
-    return [where for name, where in found.items() if name.startswith(f"{site}/")] + [
-        found["world"]
+    return [where for name, where in frames_by_name.items() if name.startswith(f"{site}/")] + [
+        frames_by_name["world"]
     ]
 
 
@@ -367,11 +367,11 @@ def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
                 transform.rotation.w,
             ]
         )
-        place = base.apply([where.x, where.y, where.z])
-        place += [transform.translation.x, transform.translation.y, transform.translation.z]
+        position = base.apply([where.x, where.y, where.z])
+        position += [transform.translation.x, transform.translation.y, transform.translation.z]
         turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
         distances = [
-            max(np.abs(at - place).max(), (way.inv() * turned).magnitude())
+            max(np.abs(at - position).max(), (way.inv() * turned).magnitude())
             for at, way in compose(frames, site)
         ]
         assert min(distances) < 1e-7

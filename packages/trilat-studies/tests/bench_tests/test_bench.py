@@ -106,10 +106,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
 def test_an_interrupted_suite_resumes_to_the_same_bytes(
     whole: BenchResults, tmp_path: Path
 ) -> None:
-    folder, made = prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), []
+    folder, finished = prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), []
 
     def stop(done: int, _total: int) -> None:
-        made.append(done)
+        finished.append(done)
         if done == 2:
             raise KeyboardInterrupt
 
@@ -118,7 +118,7 @@ def test_an_interrupted_suite_resumes_to_the_same_bytes(
     again = run_bench(
         prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), jobs=1, progress=stop
     )
-    assert made == [1, 2, 3]
+    assert finished == [1, 2, 3]
     assert again.runs == whole.runs
     assert files(again) == files(whole)
 
@@ -321,7 +321,9 @@ def test_an_interrupted_confirmation_resumes(
             prepare_bench_folder(plan_small_suite(), tmp_path / "suite"), on=executor
         )
     assert repeated[before:] == [60.0, 60.0]
-    assert [(one.confirmed, one.length_s) for one in results.runs] == [(True, 60.0)] * 3
+    assert [
+        (confirmed_run.confirmed, confirmed_run.length_s) for confirmed_run in results.runs
+    ] == [(True, 60.0)] * 3
 
 
 def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
@@ -421,10 +423,12 @@ def test_laws_get_nine_tenths_of_gravity() -> None:
         for law in laws[form]:
             reason = explain_no_cell(law, form, "gravity-90")
             assert reason == ("exact model" if law == "impedance" else bench_plan.NO_GAINS)
-    (told,) = plan_bench("full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]).cells
+    (gravity_cell,) = plan_bench(
+        "full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]
+    ).cells
     (exact,) = plan_bench("full", laws=["p_d"], tasks=["free"], links=["rtt68"]).cells
-    assert told.inputs != exact.inputs
-    controls = [cell.build(1).scenario.sites["s"].control for cell in (told, exact)]
+    assert gravity_cell.inputs != exact.inputs
+    controls = [cell.build(1).scenario.sites["s"].control for cell in (gravity_cell, exact)]
     assert [control.gravity for control in controls] == [0.9, 1.0]  # type: ignore[attr-defined]
 
 
@@ -515,7 +519,9 @@ def test_every_link_fits_both_forms() -> None:
     for link in LINKS:
         for form, base in (("three", "_bench_three"), ("two", "_bench_two")):
             scenario = load_scenario(base, build_settings(form, "outage", link))
-            cut = [name for name, one in scenario.links.items() if one.outages_s]
+            cut = [
+                name for name, delayed_link in scenario.links.items() if delayed_link.outages_s
+            ]
             assert sorted(cut) == sorted(
                 name for name in scenario.links if "s" in name.split("->")
             )

@@ -33,7 +33,7 @@ def test_part_of_suite_leaves_results_and_resumes(tmp_path: Path) -> None:
     with (folder / "places.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [float(row["error_rad"]) for row in rows] == [
-        place["error_rad"] for place in facts["places"]
+        point["error_rad"] for point in facts["places"]
     ]
     page = (folder / "bench.md").read_text()
     assert f"    trilat bench {shlex.join(SOME)} --seeds 2" in page

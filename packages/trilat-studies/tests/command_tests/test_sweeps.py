@@ -164,8 +164,8 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
     facts = json.loads((folder / "edges" / "margin.json").read_text())
     assert [point["link.delay_ms"] for point in facts["places"]] == [0.0, 40.0]
     assert (folder / "edges" / "margin.md").read_text().startswith("# ")
-    words = facts["command"].split()
-    assert words[:3] == ["trilat", "sweep", "trio.toml"]
+    command = facts["command"].split()
+    assert command[:3] == ["trilat", "sweep", "trio.toml"]
 
 
 @pytest.mark.parametrize(

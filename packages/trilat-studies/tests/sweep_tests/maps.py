@@ -44,5 +44,5 @@ def rows(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> It
 
 def make_plane(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> MapPlane:
     """Returns the plane of these rows."""
-    made = list(rows(verdict, seeds, **axes))
-    return build_plane(made, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)
+    all_rows = list(rows(verdict, seeds, **axes))
+    return build_plane(all_rows, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)

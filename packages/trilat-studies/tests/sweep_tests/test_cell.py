@@ -21,9 +21,9 @@ from trilat_net.scenario import load_scenario, parse_scenario
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
-    found = Judge()
-    monkeypatch.setattr(sweep_cell, "classify_cell", found)
-    return found
+    text_judge = Judge()
+    monkeypatch.setattr(sweep_cell, "classify_cell", text_judge)
+    return text_judge
 
 
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:

@@ -115,10 +115,10 @@ def test_a_strip_has_no_lines() -> None:
 def test_place_of_panel_is_cell_of_plan() -> None:
     """Lines belong to the scenarios that run: every cell's scenario, with every law."""
     plan = plan_sweep("p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d"))
-    made = []
+    rows_by_panel = []
     for law, row in product(("p_d", "pd_d"), rows(link__playout_ms=(0.0, 400.0))):
-        made.append({**row, "law": law})
-    plane = build_stability_map(SweepResults(plan, made), (), linearly=False).plane
+        rows_by_panel.append({**row, "law": law})
+    plane = build_stability_map(SweepResults(plan, rows_by_panel), (), linearly=False).plane
     assert [panel.title for panel in plane.panels] == [
         f"{law}, playout {ms} ms" for law in ("p_d", "pd_d") for ms in (0, 400)
     ]

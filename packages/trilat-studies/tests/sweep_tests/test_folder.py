@@ -206,10 +206,10 @@ def test_a_wrong_byte_loses_only_its_line(
     kept = read(path)
     line = five[:at].count(b"\n")
     lost = {line, line + 1} if five[at : at + 1] == b"\n" else {line}
-    assert [one for one in FIVE if one.cell not in lost] == [
-        one for one in kept if one.cell not in lost
+    assert [kept_entry for kept_entry in FIVE if kept_entry.cell not in lost] == [
+        kept_entry for kept_entry in kept if kept_entry.cell not in lost
     ]
-    assert all(one in FIVE for one in kept)
+    assert all(kept_entry in FIVE for kept_entry in kept)
 
 
 def test_lines_of_another_sweep_are_ignored(path: Path) -> None:

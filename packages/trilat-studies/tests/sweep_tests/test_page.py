@@ -173,8 +173,8 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
         assert ends[:, 1].max() - ends[:, 1].min() > 2.0
     assert first.get_linestyle() != second.get_linestyle()
     (legend,) = figure_of_lines.legends
-    words = [text.get_text() for text in legend.get_texts()]
-    assert words == ["converged", "bounded oscillation", "$d$", "linear analysis"]
+    label_texts = [text.get_text() for text in legend.get_texts()]
+    assert label_texts == ["converged", "bounded oscillation", "$d$", "linear analysis"]
 
 
 def test_the_legend_has_only_occurring_classes() -> None:
@@ -263,9 +263,9 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
     for other in others:
         assert other is not None
         assert not box.overlaps(other)
-    words = " ".join(caption.get_text().split())
-    assert words.startswith(f"not swept: {'; '.join(FIXED)}")
-    assert "trilat compare --tune" in words
+    caption_text = " ".join(caption.get_text().split())
+    assert caption_text.startswith(f"not swept: {'; '.join(FIXED)}")
+    assert "trilat compare --tune" in caption_text
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,9 @@ from .quick import DELAYS, Judge, plan_quick_sweep
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
-    found = Judge()
-    monkeypatch.setattr(sweep_cell, "classify_cell", found)
-    return found
+    text_judge = Judge()
+    monkeypatch.setattr(sweep_cell, "classify_cell", text_judge)
+    return text_judge
 
 
 @pytest.mark.long

@@ -118,10 +118,10 @@ LIMITS = {"expect": {"peak_error_max_rad": 2.0, "no_gaps": True}}
 
 @pytest.fixture
 def trial() -> Trial:
-    (made,) = trilat_net.trials(
+    (trial_made,) = trilat_net.trials(
         load_scenario("free", {"duration_s": 0.12, "link.delay_ms": 20.0, **LIMITS}), live=True
     )
-    return made
+    return trial_made
 
 
 def write_log(folder: Path, data: bytes) -> Path:

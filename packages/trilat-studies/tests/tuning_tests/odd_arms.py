@@ -41,10 +41,10 @@ def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
 
 def body(mass: float, place: str) -> str:
     """Returns the text of a ball of 5 cm."""
-    own = 0.4 * mass * 0.05**2
+    inertia = 0.4 * mass * 0.05**2
     return (
-        f'<inertial><origin xyz="{place}"/><mass value="{mass}"/><inertia ixx="{own}" ixy="0" ixz="0" '
-        f'iyy="{own}" iyz="0" izz="{own}"/></inertial>'
+        f'<inertial><origin xyz="{place}"/><mass value="{mass}"/><inertia ixx="{inertia}" ixy="0" ixz="0" '
+        f'iyy="{inertia}" iyz="0" izz="{inertia}"/></inertial>'
     )
 
 

@@ -71,16 +71,18 @@ def test_a_front_is_dominated_by_no_law(tuning_result: TuningResult) -> None:
         one.space.law: [tuning_result.plan.objective.point(score) for score in one.scores]
         for one in tuning_result.found
     }
-    every = [point for law in points.values() for point in law if point is not None]
+    all_points = [point for law in points.values() for point in law if point is not None]
     for one in tuning_result.found:
-        own = points[one.space.law]
-        assert one.front == find_pareto_front(own)
+        own_points = points[one.space.law]
+        assert one.front == find_pareto_front(own_points)
         shared = tuning_result.list_overall_front(one)
         assert set(shared) <= set(one.front)
         for place in one.front:
-            point = own[place]
+            point = own_points[place]
             assert point is not None
-            assert (place in shared) == (not any(dominates(other, point) for other in every))
+            assert (place in shared) == (
+                not any(dominates(other, point) for other in all_points)
+            )
 
 
 def test_the_command_of_a_point_repeats_its_run(tuning_result: TuningResult) -> None:
