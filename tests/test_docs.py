@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from trilat_people.devices import haply_inverse3, spacemouse
 from trilat_studies.bench import bench_plan, bench_results, bench_run
 from trilat_studies.sweep import (
     live_confirmation,
@@ -28,7 +29,6 @@ from sites import (
     retransmit_buffer,
     site_end,
 )
-from sites.devices import haply_inverse3, spacemouse
 from trilat_net.analysis import arm_rows, run_end, site_signals, stability_decision
 from trilat_net.analysis.certificate import observed_energy, premises
 from trilat_net.analysis.certificate import stability_certificate as certificates

@@ -83,7 +83,7 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
         ModuleNotFoundError: The missing module belongs to this program, which is a bug.
     """
     package = (error.name or "").partition(".")[0]
-    if package in ("", "live", "recorder", "sites", "trilat_net"):
+    if package in ("", "recorder", "sites", "trilat_net"):
         raise error
     distribution = package.replace("_", "-")
     if distribution in PACKAGE_COMMANDS:

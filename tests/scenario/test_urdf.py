@@ -292,7 +292,7 @@ def test_files_named_in_the_text_stay_closed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "arguments"),
+    ("old", "new", "phrases"),
     [
         ('<mass value="2"/>', '<mass value="-2"/>', ["link 'upper'", "-2 kg"]),
         ('<mass value="2"/>', '<mass value="0"/>', ["link 'upper'", "no mass"]),
@@ -342,15 +342,15 @@ def test_files_named_in_the_text_stay_closed() -> None:
         ),
     ],
 )
-def test_mistakes_are_refused_with_a_remedy(old: str, new: str, arguments: list[str]) -> None:
+def test_mistakes_are_refused_with_a_remedy(old: str, new: str, phrases: list[str]) -> None:
     assert old in TWO
     text = TWO.replace(old, new) if old == "robot" else TWO.replace(old, new, 1)
     message = refusal(text)
-    assert [word for word in arguments if word not in message] == []
+    assert [word for word in phrases if word not in message] == []
 
 
 @pytest.mark.parametrize(
-    ("text", "ends", "arguments"),
+    ("text", "ends", "phrases"),
     [
         (TWO, {"base": "bass"}, ["'bass'", "did you mean 'base'"]),
         (TWO, {"tip": "lowr"}, ["'lowr'", "did you mean 'lower'"]),
@@ -364,9 +364,9 @@ def test_mistakes_are_refused_with_a_remedy(old: str, new: str, arguments: list[
         (GRIPPER.replace("prismatic", "planar"), {"tip": "finger"}, ["joint 'left'", "planar"]),
     ],
 )
-def test_ends_without_arm_are_refused(text: str, ends: dict, arguments: list[str]) -> None:
+def test_ends_without_arm_are_refused(text: str, ends: dict, phrases: list[str]) -> None:
     message = refusal(text, **ends)
-    assert [word for word in arguments if word not in message] == []
+    assert [word for word in phrases if word not in message] == []
 
 
 def test_thirteen_joints_are_one_too_many() -> None:

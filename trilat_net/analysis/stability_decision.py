@@ -72,6 +72,8 @@ class LoopRoots(NamedTuple):
             pose at rest to which the roots belong, in rad.
         leaves_out: What the linearised loop leaves out, as a phrase, for example "how the
             program at m2 reacts to the arms". Empty if it contains everything.
+        is_numerical: True if the code of a user's law was differentiated numerically. Such
+            roots can refute a run, but not prove it stable.
     """
 
     verdict: str
@@ -80,6 +82,7 @@ class LoopRoots(NamedTuple):
     text: str
     distance_rad: float = 0.0
     leaves_out: str = ""
+    is_numerical: bool = False
 
     @property
     def is_proof(self) -> bool:
@@ -87,11 +90,15 @@ class LoopRoots(NamedTuple):
         return self.exact and self.verdict == "stable"
 
     def describe_as_basis(self) -> str:
-        """Returns the roots as the basis of a decision, for example "exact roots"."""
+        """Returns on what a decision rests if these roots of the control loop decide it.
+
+        For example "exact roots, slowest -0.832 /s".
+        """
+        name = "roots by numerical derivatives" if self.is_numerical else "exact roots"
         if self.rate_per_s is None:
-            return "exact roots"
+            return name
         decisive = "fastest growing" if self.is_refutation else "slowest"
-        return f"exact roots, {decisive} {self.rate_per_s:+.3g} /s"
+        return f"{name}, {decisive} {self.rate_per_s:+.3g} /s"
 
     @property
     def is_refutation(self) -> bool:

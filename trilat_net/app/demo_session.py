@@ -38,6 +38,7 @@ from sites.machine_load import describe_load, measure_busy_share
 from sites.site_parts import warm_up
 from trilat_net.core.step.jit import compiling_notice, is_core_cached
 from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import (
     create_file,
@@ -306,8 +307,12 @@ def run_demo(
 
     Raises:
         ScenarioError: The scenario lacks the limits of an external arm.
+        UsageError: A user is a program of its own, and the package trilat-people is missing.
     """
     check_outside_arms(scenario)
+    if any(_needs_hand_process(scenario, name) for name in scenario.names):
+        # A missing package is reported now, and not by a process in the middle of the start.
+        load_entry(COMMANDS, "hand", "trilat hand")
     result = SessionResult(folder / "run.mcap")
     session = scenario.name
     clock = SystemClock()
@@ -431,8 +436,7 @@ def _start(
         arguments += [*chain(*connect[:index]), "--needs-recorder", *patience]
         processes.append(starter.start(name, arguments))
     for index, name in enumerate(scenario.names):
-        own_hand = find_own_hand(scenario, name)
-        if own_hand is not None and own_hand.has_separate_process:
+        if _needs_hand_process(scenario, name):
             arguments = ["hand", name, *common, *connect[index], *patience]
             processes.append(starter.start(f"hand-{name}", arguments))
 
@@ -440,6 +444,17 @@ def _start(
     record += [*patience, "--force"]
     start_recorder = partial(starter.start, topics.RECORDER, record)
     return starter, processes, start_recorder
+
+
+def _needs_hand_process(scenario: Scenario, site: str) -> bool:
+    """Returns True if the user of a site is a program that runs in a process of its own.
+
+    Args:
+        scenario: The scenario.
+        site: Name of the site.
+    """
+    own_hand = find_own_hand(scenario, site)
+    return own_hand is not None and own_hand.has_separate_process
 
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:

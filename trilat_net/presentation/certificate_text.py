@@ -292,7 +292,8 @@ def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[Certifica
         return []  # the text about the pushes states no rate of a push
     if f"{roots.rate_per_s:+.3g}" == f"{worst.rate_per_s:+.3g}":
         return []
-    accuracy = "exact" if roots.exact else "an approximation"
+    is_exact = roots.exact and not roots.is_numerical
+    accuracy = "exact" if is_exact else "an approximation"
     text = (
         f"of the two rates, exp(rate t), that of the roots is {accuracy}, for small motions "
         "near the final pose; that of the pushes is measured along this run, from "

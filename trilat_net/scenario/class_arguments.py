@@ -58,7 +58,7 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
         signature = inspect.signature(kind)
     except (TypeError, ValueError):
         return  # a class of C code has no signature, and itself refuses wrong arguments
-    parameters = list(signature.parameters.values())[1:]
+    parameters = list(signature.parameters.values())[1:]  # without the facts
     named = {
         parameter.name: parameter
         for parameter in parameters

@@ -340,7 +340,9 @@ def _compute_roots(loop: EndLoop) -> LoopRoots:
         exact = exact and not loop.programs
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
         return roots._replace(
-            distance_rad=loop.distance_rad, leaves_out=_name_left_out(loop.programs)
+            distance_rad=loop.distance_rad,
+            leaves_out=_name_left_out(loop.programs),
+            is_numerical=has_imported_law,
         )
     continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
     basis = ", in continuous time"

@@ -46,7 +46,7 @@ def sim_command(
     It writes the same kind of log as a live session.
     """
     from ...execution.virtual import record_virtual
-    from ...log.ros2.viz_channels import parse_viz_rate
+    from ...log.view_rates import parse_viz_rate
     from ...scenario.code_consent import find_user_laws
     from ...scenario.validate import write_simulated_options
 

@@ -120,7 +120,7 @@ def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
     assert plan_from_json(verdicts.facts()).judge == "verdict"
     prepare_sweep_folder(verdicts, tmp_path / "o")
     longest = plan_quick_sweep(tmp_path, judge="twins", longest_s=verdicts.longest_s)
-    with pytest.raises(UsageError, match="another judge: there verdict, here twins"):
+    with pytest.raises(UsageError, match="another judge: verdict in the folder, twins now"):
         prepare_sweep_folder(longest, tmp_path / "o")
     assert (twins.longest_s, verdicts.longest_s) == (0.5, 4.0)
     with pytest.raises(UsageError, match="verdict, twins, not 'luck'"):

@@ -47,10 +47,10 @@ def test_the_same_sweep_resumes_in_its_folder(sweep_folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "settings", "arguments"),
+    ("overrides", "settings", "phrases"),
     [
         (["control.Kp=2"], {}, ("another scenario", "trio (sha256 ")),
-        (["control.Kd=3"], {}, ("other settings", "there none, here control.Kd=3")),
+        (["control.Kd=3"], {}, ("other settings", "none in the folder, control.Kd=3 now")),
         (
             [],
             {"over": [DAMPING]},
@@ -66,14 +66,14 @@ def test_another_sweep_is_refused_with_its_differences(
     sweep_folder: Path,
     overrides: list[str],
     settings: dict[str, Any],
-    arguments: tuple[str, ...],
+    phrases: tuple[str, ...],
 ) -> None:
     problem = refused(sweep_folder, *overrides, **settings)
     for word in (
         str(sweep_folder),
         "results cannot be mixed",
         "choose another folder",
-        *arguments,
+        *phrases,
     ):
         assert word in problem
 
@@ -90,7 +90,7 @@ def test_another_arithmetic_or_program_is_refused(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
-        reason = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
+        reason = f"another kind of arithmetic: {compute_fingerprint()} in the folder, 0000"
         assert reason in refused(sweep_folder)
     older = {**collect_provenance(), "version_numba": "0.1"}
     monkeypatch.setattr(folders, "collect_provenance", lambda: older)

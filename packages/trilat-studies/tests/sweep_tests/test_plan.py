@@ -147,7 +147,7 @@ def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("over", "arguments"),
+    ("over", "phrases"),
     [
         (
             ["link.delay=0:1:1"],
@@ -165,10 +165,10 @@ def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_axes_are_refused_before_any_run(
-    over: list[str], arguments: tuple[str, ...]
+    over: list[str], phrases: tuple[str, ...]
 ) -> None:
     problem = refused("p_d_margin", over=over)
-    for word in arguments:
+    for word in phrases:
         assert word in problem
 
 
@@ -190,7 +190,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("laws", "arguments"),
+    ("laws", "phrases"),
     [
         (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
         (
@@ -201,10 +201,10 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
     ],
 )
 def test_a_law_that_cannot_be_swept_is_refused(
-    laws: list[str], arguments: tuple[str, ...]
+    laws: list[str], phrases: tuple[str, ...]
 ) -> None:
     problem = refused("p_d_margin", laws=laws)
-    for word in arguments:
+    for word in phrases:
         assert word in problem
 
 
@@ -278,7 +278,7 @@ def test_huge_ranges_take_no_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "arguments"),
+    ("text", "phrases"),
     [
         ("link.delay_ms", ("KEY=VALUES", "'link.delay_ms'")),
         ("=1,2", ("KEY=VALUES",)),
@@ -305,10 +305,10 @@ def test_huge_ranges_take_no_memory() -> None:
     ],
 )
 def test_invalid_axes_beside_valid_ones_are_refused(
-    text: str, arguments: tuple[str, ...]
+    text: str, phrases: tuple[str, ...]
 ) -> None:
     problem = axis_refused(text)
-    for word in arguments:
+    for word in phrases:
         assert word in problem
 
 

@@ -191,10 +191,10 @@ def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    def refused(path: Path, *arguments: str) -> None:
+    def refused(path: Path, *phrases: str) -> None:
         with pytest.raises(UsageError) as error:
             read_results(path)
-        for word in (str(path), *arguments):
+        for word in (str(path), *phrases):
             assert word in str(error.value)
 
     begun = prepare_sweep_folder(plan_quick_sweep(tmp_path), tmp_path / "o").path

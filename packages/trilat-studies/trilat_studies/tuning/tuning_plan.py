@@ -779,6 +779,10 @@ def plan_tuning(
         for other_seed in range(scenario.seed + 1, scenario.seed + seeds):
             texts = (*overrides, f"seed={other_seed}")
             others.append(load_tuning_scenario(source, texts))
+    for space in spaces:
+        # a law may refuse the scenario, for example its scheme: before the search, not in it
+        middle = CandidateSearch(space, 1, seed, Objective(objective)).propose_candidates(0)
+        base.with_gains(space, knowledge, middle[0])
     return TuningPlan(
         base=base,
         spaces=spaces,
