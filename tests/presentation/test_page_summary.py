@@ -150,7 +150,8 @@ def test_key_numbers_have_place_and_time() -> None:
         assert f"joint {joint + 1}, at {peak.t_s:.2f} s; {last:.3g} rad in the last" in html
     undelayed_rad = measure_undelayed_error(RunView(log), "s")["undelayed_max_rad"].value
     assert undelayed_rad is not None
-    assert f"{undelayed_rad:.3g} rad at the same moment" in html
+    tile = f"<dt>s from where the masters are</dt><dd>{undelayed_rad:.3g} rad</dd>"
+    assert tile in html
     # the remote arm is first
     assert html.index("<dt>s from") < html.index("<dt>m1 and m2 from")
     assert "<dd>200 ms</dd>" in html

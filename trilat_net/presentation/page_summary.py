@@ -253,8 +253,8 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
     masters = [site for site in log.sites if site not in slaves]
     cards = []
     if slaves:
-        card = _describe_errors(log, slaves, "from where the masters lead")
-        cards.append(card._replace(detail=card.detail + _describe_undelayed_error(log, slaves)))
+        cards.append(_describe_errors(log, slaves, "from where the masters lead"))
+        cards += _describe_undelayed_error(log, slaves)
     if masters:
         cards.append(_describe_errors(log, masters, "from the others"))
     return cards
@@ -285,7 +285,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     return _KeyNumber(f"{join_words(sites)} {place}", f"{peak.value:.3g} {unit}", detail)
 
 
-def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> str:
+def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumber]:
     """Returns the largest distance of the slaves from where the others were at the same time.
 
     The error compares a slave with what its peers sent some time ago. A reader who sees the
@@ -296,7 +296,7 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> str:
         slaves: Names of the slaves.
 
     Returns:
-        A sentence that follows other text. Empty if the distance is unknown.
+        The number in a list. Empty if the distance is unknown.
     """
     view = RunView(log)
     unit = "rad" if shared_unit(log) == "rad" else "m"
@@ -305,8 +305,9 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> str:
     ]
     known = [error for error in errors if error is not None]
     if not known:
-        return ""
-    return f"; {max(known):.3g} {unit} at the same moment"
+        return []
+    name = f"{join_words(slaves)} from where the masters are"
+    return [_KeyNumber(name, f"{max(known):.3g} {unit}", "largest, with the delay included")]
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:

@@ -56,7 +56,9 @@ def test_a_resumed_sweep_keeps_its_metrics(tmp_path: Path) -> None:
     results = run_metric_sweep(tmp_path / "o")
     assert read_results(tmp_path / "o").to_rows() == results.to_rows()
     assert run_metric_sweep(tmp_path / "o").to_rows() == results.to_rows()
-    with pytest.raises(UsageError, match=r"other metrics: settle_s, .* in the folder, none now"):
+    with pytest.raises(
+        UsageError, match=r"other metrics: settle_s, .* in the folder, none now"
+    ):
         trilat_net.sweep("two_sites", AXIS, ["duration_s=0.5"], out=tmp_path / "o", jobs=1)
 
 
