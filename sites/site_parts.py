@@ -43,7 +43,8 @@ from trilat_net.scenario.operators.program_hand import (
     find_own_hand,
     make_hand_program,
 )
-from trilat_net.scenario.own_plant import OwnPlant, PlantPlayer
+from trilat_net.scenario.own_plant import OwnPlant
+from trilat_net.scenario.plant_player import PlantPlayer
 from trilat_net.scenario.run_changes import make_site_order, to_core_change
 from trilat_net.scenario.scenario_types import SiteOrder
 from trilat_net.signals import Interrupt

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from trilat_net.hooks import find_hook, list_hooks
 
-from . import house, line_figures, reading_walk
+from . import house, line_figures, part_interfaces, reading_walk
 
 ARM_STAGES = ("trilat_net/core/arms/chain_stages.py", "trilat_net/core/arms/two_link_stages.py")
 PLUG_INS = {
@@ -47,6 +47,16 @@ MOST_WORDS = 8
 """The most words in the name of a test, without `test`."""
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
+INTERFACE_LIMITS = {  # part: how many of its names other parts import
+    "kernel": 288,
+    "session": 297,
+    "analysis": 120,
+    "app": 68,
+    "studies": 9,
+    "people": 19,
+    "ros2": 31,
+}
+"""A number here only falls; `python -m tests.part_interfaces --count` prints them."""
 TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
 
 
@@ -149,6 +159,21 @@ def test_every_import_between_rooms_has_its_reason() -> None:
     told = {(row["package"], row["imports"]) for row in rows}
     assert told == house.room_imports()
     assert len(told) <= 102  # two of them are what packages of others may use
+
+
+@pytest.mark.push
+def test_every_name_that_another_part_uses_is_listed() -> None:
+    """`python -m tests.part_interfaces` writes the table; its change shows what a part gives to others."""
+    assert part_interfaces.read_table() == part_interfaces.list_interfaces()
+
+
+@pytest.mark.push
+def test_parts_use_no_more_names_of_each_other() -> None:
+    counts = part_interfaces.count_names()
+    assert set(counts) <= set(INTERFACE_LIMITS)
+    assert {
+        part: counts[part] for part in counts if counts[part] > INTERFACE_LIMITS[part]
+    } == {}
 
 
 @pytest.mark.push

@@ -94,7 +94,7 @@ if _TYPE_CHECKING:
     from .scenario import read_template as read_template
     from .scenario.delay_traces import import_trace as import_trace
     from .scenario.describe import describe_scenario as describe_scenario
-    from .scenario.own_plant import PlantContext as PlantContext
+    from .scenario.plant_player import PlantContext as PlantContext
     from .scenario.simulated_arm import SimulatedArm as SimulatedArm
     from .scenario.skeletons import new_hand as new_hand
     from .scenario.skeletons import new_law as new_law
@@ -127,7 +127,7 @@ _NAMES = {
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",
     "trilat_net.scenario.delay_traces": "import_trace",
-    "trilat_net.scenario.own_plant": "PlantContext",
+    "trilat_net.scenario.plant_player": "PlantContext",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
 }

@@ -19,7 +19,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.imported_code import allowed_code
 from trilat_net.scenario.operators.program_hand import HandPlayer, find_own_hand
-from trilat_net.scenario.own_plant import make_plant_players
+from trilat_net.scenario.plant_player import make_plant_players
 
 SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
 

@@ -41,6 +41,16 @@ def test_a_failing_measurement_gives_its_reason(monkeypatch: pytest.MonkeyPatch)
         assert finding.text.endswith("failed (exit code 1: MemoryError: no more pages)")
 
 
+def test_processes_of_their_own_measure() -> None:
+    short = "from trilat_net.app import doctor; doctor.RATES_HZ = (100,); doctor.REHEARSAL_S = 0.05\n"
+    ((rate_hz, late_us, largest_us),) = doctor._run_in_process(short + doctor._RATES_CODE)
+    assert rate_hz == 100
+    assert 0 <= late_us <= largest_us
+    assert {"scheduling", "memory", "timer_slack"} <= set(
+        doctor._run_in_process(doctor._RIGHTS_CODE)
+    )
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     keys_folder = tmp_path_factory.mktemp("deployment") / "keys"

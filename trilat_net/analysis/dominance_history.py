@@ -435,7 +435,7 @@ KD_SHAPE_TOLERANCE = 1e-9
 """Largest relative difference of two gains that count as equal."""
 
 
-class LyapunovWeights(NamedTuple):
+class _LyapunovWeights(NamedTuple):
     """Weights beta of the N sites in the energy function V of the stability proof.
 
     With these weights the energies that sites transfer to each other cancel in V. They follow
@@ -534,7 +534,7 @@ def find_kd_scales(Kd: Array) -> Array | None:
     return scales
 
 
-def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
+def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     """Computes the weight of each site in the energy function of the stability proof.
 
     A site is the process that runs one arm. Its weight is beta_i = pi_i / c_i, where pi is the
@@ -552,7 +552,7 @@ def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
     beta = pi if scales is None else pi / scales
     sites = len(beta)
     factor = sites / beta.sum()
-    return LyapunovWeights(
+    return _LyapunovWeights(
         beta=beta * factor,
         groups=find_closed_groups(alpha),
         scales=scales,

@@ -34,7 +34,7 @@ from typing import Any
 from rich.console import Console
 from setproctitle import setproctitle
 
-from sites.machine_load import describe_load, measure_busy_share
+from sites.machine_load import check_machine_load
 from sites.site_parts import warm_up
 from trilat_net.core.step.jit import compiling_notice, is_core_cached
 from trilat_net.core.step.ticks import NS_PER_S
@@ -322,7 +322,7 @@ def run_demo(
         ExitStack() as reserved,
     ):
         compile_core(scenario, display.say, interrupt)
-        load_warning = describe_load(measure_busy_share(clock))
+        load_warning = check_machine_load(clock)
         if load_warning:
             display.say(f"warning: {load_warning}")
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))

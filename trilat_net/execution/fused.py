@@ -52,7 +52,7 @@ from ..scenario import Scenario
 from ..scenario.code_consent import find_user_laws
 from ..scenario.operators.kernel_operators import Wall
 from ..scenario.operators.program_hand import make_hand_players
-from ..scenario.own_plant import PlantPlayer
+from ..scenario.plant_player import PlantPlayer
 from ..scenario.validate import refuse_external_arms
 
 

@@ -56,7 +56,7 @@ from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.program_hand import POLICY, make_hand_players
-from ..scenario.own_plant import PlantPlayer, make_plant_players
+from ..scenario.plant_player import PlantPlayer, make_plant_players
 from ..scenario.validate import refuse_external_arms
 from .resumption import read_output, select_peer_channels
 from .virtual_network import Network, PromptNetwork

@@ -185,11 +185,11 @@ def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """
-    sentences = [explain_judgement(certificate), *certificate.remarks]
+    sentences = [_explain_judgement(certificate), *certificate.remarks]
     return [CertificateLine("note", sentence) for sentence in sentences if sentence]
 
 
-def explain_judgement(certificate: Certificate) -> str:
+def _explain_judgement(certificate: Certificate) -> str:
     """Returns what a judgement means for small disturbances, as a sentence in plain words.
 
     Args:

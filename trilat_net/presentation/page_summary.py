@@ -27,7 +27,6 @@ from ..analysis.site_signals import (
     JointError,
     find_error_of_last_second,
     find_largest_error,
-    shared_unit,
 )
 from ..analysis.timeline import list_alarms
 from ..errors import count_nouns, join_words
@@ -38,6 +37,7 @@ from ..scenario.expect import END_WINDOW_S
 from .certificate_text import describe_pace
 from .html_templates import render_macro
 from .page_html import NO_NUMBER, format_cell, render_details
+from .plot_signals import shared_unit
 from .style import typeset
 
 _MAX_ALARMS = 8

@@ -106,7 +106,7 @@ def allow_own_code(
     return scenario
 
 
-class RememberedFile(msgspec.Struct):
+class _RememberedFile(msgspec.Struct):
     """File with a user's code for which a person has stored a permission to run.
 
     Attributes:
@@ -158,7 +158,7 @@ def allow_logged_code(
     for file in files:
         sha256, keys = _allow_file(file, logged, other_version=other_version)
         if remember:
-            entry = remembered.setdefault(sha256, RememberedFile(""))
+            entry = remembered.setdefault(sha256, _RememberedFile(""))
             entry.file = str(file.resolve())
             for key in keys:
                 settings = entry.classes.setdefault(_class_of(key), [])
@@ -167,7 +167,7 @@ def allow_logged_code(
             _write_store(remembered)
 
 
-def _load_remembered_settings(remembered: Mapping[str, RememberedFile]) -> None:
+def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
     """Makes the stored arguments available to the messages about refused code.
 
     Args:
@@ -192,7 +192,7 @@ def _find_store() -> Path:
     return Path(folder, "trilat-net", "laws.json")
 
 
-def _read_store() -> dict[str, RememberedFile]:
+def _read_store() -> dict[str, _RememberedFile]:
     """Returns the stored permissions, by the hash of the file.
 
     If there is no store, or it cannot be read, there are no permissions. Earlier versions of
@@ -201,16 +201,16 @@ def _read_store() -> dict[str, RememberedFile]:
     # A RuntimeError is raised if the user has no home folder.
     with suppress(OSError, ValueError, RuntimeError):
         entries = msgspec.json.decode(
-            _find_store().read_bytes(), type=dict[str, RememberedFile | str]
+            _find_store().read_bytes(), type=dict[str, _RememberedFile | str]
         )
         return {
-            sha256: RememberedFile(entry) if isinstance(entry, str) else entry
+            sha256: _RememberedFile(entry) if isinstance(entry, str) else entry
             for sha256, entry in entries.items()
         }
     return {}
 
 
-def _write_store(remembered: Mapping[str, RememberedFile]) -> None:
+def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
     """Writes the stored permissions."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
@@ -267,7 +267,7 @@ def _compare_hashes(key: CodeKey, sha256: str) -> str:
     return f"its sha256 is {sha256[:16]}, but was {key.sha256[:16]}"
 
 
-class LoggedUserLaw(NamedTuple):
+class _LoggedUserLaw(NamedTuple):
     """Control law of a user that a log names, and whether it may run on this computer.
 
     Attributes:
@@ -307,7 +307,7 @@ class LoggedUserLaw(NamedTuple):
         return f"{problem}; if you trust it: --law {option}"
 
 
-def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
+def find_user_laws(scenario: "Scenario") -> list[_LoggedUserLaw]:
     """Returns the control laws in a scenario that are users' classes.
 
     None of their code is run. Each entry tells whether the law may run, and which file would be
@@ -338,7 +338,7 @@ def may_run_user_laws(scenario: "Scenario") -> bool:
     return all(law.allowed for law in find_user_laws(scenario))
 
 
-def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> LoggedUserLaw:
+def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> _LoggedUserLaw:
     """Finds the file of a user's control law, and whether the law may run.
 
     None of its code is run.
@@ -363,7 +363,7 @@ def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) ->
     settings = ", ".join(
         f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()
     )
-    return LoggedUserLaw(
+    return _LoggedUserLaw(
         code=key.code,
         sites=sites,
         settings=settings,

@@ -34,8 +34,9 @@ from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
 from ..laws.interface import LawSettings, check_law_class
-from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
+from ..laws.sent_vectors import SentVectorSpecs, convert_sends
 from .class_arguments import make_own_instance
+from .sent_channel import parse_classes
 
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
@@ -67,7 +68,7 @@ def call_directly(_k: int, function: Callable[[], Any]) -> Any:
     return function()
 
 
-class NamedCode(Protocol):
+class _NamedCode(Protocol):
     """Interface of an entry of a scenario that names a user's class.
 
     The class is a control law, an operator (a program that moves an arm) or a plant (a program
@@ -112,7 +113,7 @@ class CodeKey(NamedTuple):
     settings: str
 
     @classmethod
-    def of(cls, named: NamedCode) -> "CodeKey":
+    def of(cls, named: _NamedCode) -> "CodeKey":
         """Returns the identification under which a user's class may be permitted to run.
 
         Args:
@@ -250,7 +251,7 @@ def describe_setting(value: Any) -> str:
     return f"{text[:half]} ... {text[-half:]} ({len(text)} characters)"
 
 
-_executed: dict["CodeSource", Any] = {}
+_executed: dict["_CodeSource", Any] = {}
 """Modules that were executed from a file that a person named, by the content of the file."""
 
 
@@ -303,7 +304,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
         return make
 
 
-class CodeSource(NamedTuple):
+class _CodeSource(NamedTuple):
     """Python file that defines a user's class, as it was read from disk.
 
     Its content is stored, so that exactly the checked text is run.
@@ -319,7 +320,7 @@ class CodeSource(NamedTuple):
     sha256: str
 
 
-def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
+def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
     """Reads the file that defines a class, without running any code of it.
 
     Args:
@@ -338,7 +339,7 @@ def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
         raise ScenarioError(
             f"{source_file} cannot be read: {error.strerror}", path=path
         ) from None
-    return CodeSource(source_file, content, hashlib.sha256(content).hexdigest())
+    return _CodeSource(source_file, content, hashlib.sha256(content).hexdigest())
 
 
 def _find_file(code: str, path: str) -> Path:
@@ -472,7 +473,7 @@ PAGES = {
 """For each required method: the name of such a class, and its page in the docs."""
 
 
-def check_class(source: CodeSource, code: str, path: str, method: str = "torque") -> None:
+def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
     """Refuses a file that does not define a certain class with a certain method.
 
     The check reads the syntax of the file, and runs no code of it.
@@ -517,7 +518,7 @@ def _import(module: str, sha256: str) -> Any:
     return imported
 
 
-def _execute(module: str, source: CodeSource) -> Any:
+def _execute(module: str, source: _CodeSource) -> Any:
     """Executes the content of a file as a module, and returns the module.
 
     Exactly the content that was checked is executed. Python's own import might read the file

@@ -35,9 +35,15 @@ import numpy as np
 from ..core.arms.two_link_arm import ArmLinks
 from ..core.links import dominance
 from ..errors import ScenarioError, count_nouns, suggest_nearest
-from ..fields import (
-    Frozen,
-    TomlTable,
+from ..fields import Frozen, TomlTable, reword_problem, split_refusal
+from ..files import open_regular
+from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
+from .delay_models import DELAY_MODELS
+from .delay_traces import read_trace
+from .distributions import Draws
+from .expect import Expect, number_window_joints
+from .imported_code import CLASS_PATTERN, read_code
+from .key_checks import (
     VectorCounts,
     check_choice,
     check_finite,
@@ -48,17 +54,7 @@ from ..fields import (
     find_count_problem,
     is_distribution,
     is_number,
-    reword_problem,
-    split_refusal,
 )
-from ..files import open_regular
-from ..laws.sent_vectors import parse_classes, read_sends
-from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
-from .delay_models import DELAY_MODELS
-from .delay_traces import read_trace
-from .distributions import Draws
-from .expect import Expect, number_window_joints
-from .imported_code import CLASS_PATTERN, read_code
 from .laws import LAWS
 from .link_inertia import LinkInertia
 from .operators import ENVIRONMENTS, OPERATORS, HeldArm, resolve_operators
@@ -71,6 +67,7 @@ from .scenario_types import (
     Scenario,
     SiteSpec,
 )
+from .sent_channel import parse_classes, read_sends
 from .urdf import MAX_CHARACTERS
 
 _TOP_LEVEL_KEYS = (

@@ -40,7 +40,7 @@ from trilat_net.log.orientations import expand_poses
 from trilat_net.scenario import Scenario, find_site, load_scenario
 from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
-from trilat_net.scenario.own_plant import make_plant_players
+from trilat_net.scenario.plant_player import make_plant_players
 
 from .reachable_places import can_reach
 
@@ -239,7 +239,7 @@ class ReachTask:
         return Judgement(reward, succeeded=succeeded)
 
 
-class ActedHand(HandPlayer):
+class _ActedHand(HandPlayer):
     """Simulated operator that moves the user's arm with the actions of a policy.
 
     Args:
@@ -535,7 +535,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._actions = list[Array]()
         self._clipped_actions = 0
         hand_site = self._build_hand_site(scenario)
-        self._player = ActedHand(hand_site, self._actions)
+        self._player = _ActedHand(hand_site, self._actions)
         self._plants = make_plant_players(scenario)  # users' programs that move arms, by site
         hands = {self._user: self._player}
         ticks = [scenario.ticks(name) for name in scenario.names]
@@ -838,7 +838,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not self._actions:
             raise UsageError("an episode has no log before its first step")
         hand_site = self._build_hand_site(self.scenario)
-        player = ActedHand(hand_site, self._actions)
+        player = _ActedHand(hand_site, self._actions)
         hands = {self._user: player.track}
         elapsed_s = self._k / self._tick_rate_hz
         scenario = replace(self.scenario, duration_s=elapsed_s)

@@ -326,7 +326,7 @@ TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 """Headers of the columns of the table of expectations."""
 
 
-class ExpectationRow(NamedTuple):
+class _ExpectationRow(NamedTuple):
     """One expectation of a scenario, with the results of all runs of this scenario.
 
     The runs differ in their seeds. The object is a row in the table of a `TrialReport`.
@@ -385,7 +385,7 @@ class TrialReport(Result):
             groups.setdefault(result.trial.source, []).append(result)
         return groups
 
-    def rows(self) -> list[ExpectationRow]:
+    def rows(self) -> list[_ExpectationRow]:
         """Combines the results of each scenario to one row per expectation.
 
         If some runs of a scenario have no result, another row states their number.
@@ -399,7 +399,7 @@ class TrialReport(Result):
             for key, outcomes in outcomes_by_key.items():
                 # An unmet expectation is worse than any other. After that the margin decides.
                 worst = min(outcomes, key=lambda outcome: (outcome.held, outcome.margin or 0.0))
-                row = ExpectationRow(
+                row = _ExpectationRow(
                     scenario=name,
                     key=key,
                     worst=worst,
@@ -411,7 +411,7 @@ class TrialReport(Result):
 
             errors = [result.error for result in results if result.error]
             if errors:
-                row = ExpectationRow(
+                row = _ExpectationRow(
                     scenario=name,
                     key="a result",
                     worst=ExpectationResult("a result", False, errors[0], ""),

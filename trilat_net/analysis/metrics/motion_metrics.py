@@ -90,7 +90,7 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     Quantity("settle_s", "settling time", "s"),
     *list_shared_quantities(_ERRORS),
 )
-def measure_tracking(view: RunView, site: str) -> MetricValues:
+def _measure_tracking(view: RunView, site: str) -> MetricValues:
     """Measures how well a site tracks its reference: settling time, RMS and peak of the error.
 
     The error e is the difference between the coordinates of the site and their reference, the
@@ -188,7 +188,7 @@ def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
 
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
-def measure_spread(view: RunView, _run: str) -> MetricValues:
+def _measure_spread(view: RunView, _run: str) -> MetricValues:
     """Measures the spread of a run: how far the sites are apart at the same instant.
 
     It is the largest difference of a joint angle between two sites. In task space the positions
@@ -234,7 +234,7 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
 
 
 @measures("link", FOLLOWING, *list_shared_quantities(_DELAYED_DISTANCES))
-def measure_following(view: RunView, link: str) -> MetricValues:
+def _measure_following(view: RunView, link: str) -> MetricValues:
     """Measures how far a slave is from the delayed motion of its master.
 
     The distance is q_m(t - T) - q_s, where T is the age of the sample in use, the state of the
@@ -289,7 +289,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("saturated_share", "ticks at the limit"),
     Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
 )
-def measure_effort(view: RunView, site: str) -> MetricValues:
+def _measure_effort(view: RunView, site: str) -> MetricValues:
     """Measures how much torque a site's controller applies, and how often it is at the limit.
 
     Args:
@@ -336,7 +336,7 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     Quantity("end_force_peak_n", "its peak, last 5 s", "N"),
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
-def measure_wall_contact(view: RunView, name: str) -> MetricValues:
+def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
     """Measures the contact of an end effector with a virtual wall: force, hits and depth.
 
     The numbers are given for the whole run and for its last 5 s. A contact in the first record,
@@ -376,7 +376,7 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
     return {key: metrics[key] for key in unavailable(CONTACT, "")}  # in the declared order
 
 
-class BaseEstimates(NamedTuple):
+class _BaseEstimates(NamedTuple):
     """Estimates of the base parameters of a chain, which are those that torques determine.
 
     The parameters of neighbouring links act on the torques only in certain combinations, the
@@ -419,7 +419,7 @@ class ParameterEstimates(NamedTuple):
     first: list[float]
     last: list[float]
     slope_per_s: list[float] | None
-    base: BaseEstimates | None = None
+    base: _BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
         """Returns the parameter estimates of the arm as plain values, ready for JSON."""
@@ -430,7 +430,9 @@ class ParameterEstimates(NamedTuple):
         return content
 
 
-def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
+def _read_parameter_estimates(
+    scenario: Scenario, records: AlignedRecords
+) -> ParameterEstimates:
     """Reads from the records what a site learnt about the dynamic parameters of its arm.
 
     Args:
@@ -480,7 +482,7 @@ def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
         The estimates, by name of the site. Sites without records are missing.
     """
     return {
-        site: read_parameter_estimates(view.scenario, run.records)
+        site: _read_parameter_estimates(view.scenario, run.records)
         for site, run in view.sites.items()
     }
 
@@ -490,8 +492,8 @@ def _estimate_base_parameters(
     learnt: Bools,
     theta: list[float] | None,
     theta_hat: Array,
-) -> BaseEstimates:
-    """Returns the estimates of a chain in base parameters, see `BaseEstimates`.
+) -> _BaseEstimates:
+    """Returns the estimates of a chain in base parameters, see `_BaseEstimates`.
 
     Args:
         arm: The chain.
@@ -506,7 +508,7 @@ def _estimate_base_parameters(
     true_base = None
     if theta is not None:
         true_base = (base.combination @ np.array(theta)).tolist()
-    return BaseEstimates(
+    return _BaseEstimates(
         parameter=base.kept.tolist(),
         theta=true_base,
         first=first,
@@ -526,7 +528,7 @@ def _estimate_base_parameters(
     Quantity("theta_slope_per_s", "|theta_hat'|, last 5 s", "1/s"),
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
-def measure_parameter_error(view: RunView, site: str) -> MetricValues:
+def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
     """Measures how far a site's estimates of its arm's parameters are from the true values.
 
     For a chain of joints the errors are computed in base parameters, which are the combinations
@@ -629,7 +631,7 @@ def _compute_parameter_energy(
     Quantity("burst", "lost in a row, mean"),
     Quantity("late_samples", "late samples", "", "sum"),
 )
-def measure_network(view: RunView, name: str) -> MetricValues:
+def _measure_network(view: RunView, name: str) -> MetricValues:
     """Measures a link: the effective delay, lost samples and bursts of losses.
 
     The effective delay is the age of the sample that the receiver uses.
@@ -667,7 +669,7 @@ def measure_network(view: RunView, name: str) -> MetricValues:
     Quantity("overruns", "overruns", "", "sum"),
     Quantity("missing", "missing records", "", "sum"),
 )
-def measure_loop(view: RunView, site: str) -> MetricValues:
+def _measure_loop(view: RunView, site: str) -> MetricValues:
     """Measures the timing of a site's control loop, and counts its missing records.
 
     Args:

@@ -40,9 +40,9 @@ from ...log.record_columns import Ints
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay
-from ...scenario.delay_period import find_final_link, is_ending_trace
 from ...scenario.imported_code import ImportedLaw
 from ...scenario.sample_uses import draw_used_samples
+from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
 from ..stability_decision import LoopRoots
@@ -68,7 +68,7 @@ _BATCH_RECORDS = 4096
 """Number of records of each site that are read from a simulated run at a time."""
 
 
-class EndLoop(NamedTuple):
+class _EndLoop(NamedTuple):
     """The control loop at the end of a run, with the rest about which it is linearised.
 
     Attributes:
@@ -144,7 +144,7 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     return _compute_roots(loop)
 
 
-def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
+def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
     """Finds the control loop at the end of a recorded run, and the rest next to its end.
 
     Args:
@@ -187,7 +187,7 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
     return loop._replace(programs=tuple(list_program_sites(log)))
 
 
-def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
+def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
     """Finds the control loop at the end of a simulated run, and the rest next to its end.
 
     The loop is that of a log of the same run. The code of imported control laws is executed.
@@ -287,7 +287,7 @@ class _EndState(NamedTuple):
 
 def _build_end_loop(
     final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
-) -> EndLoop:
+) -> _EndLoop:
     """Returns the final loop, with the equilibrium nearest to a state.
 
     Args:
@@ -306,7 +306,7 @@ def _build_end_loop(
     rest = follow_equilibrium(final.scenario, settle_memories(conditions, end))
     last_q = _find_last_angles(final.scenario, trace)
     distance_rad = float(np.abs(last_q - rest.q).max())
-    return EndLoop(
+    return _EndLoop(
         scenario=final.scenario,
         conditions=conditions,
         rest=rest,
@@ -317,7 +317,7 @@ def _build_end_loop(
     )
 
 
-def _compute_roots(loop: EndLoop) -> LoopRoots:
+def _compute_roots(loop: _EndLoop) -> LoopRoots:
     """Computes the rightmost roots of a loop, as a certificate states them.
 
     Args:

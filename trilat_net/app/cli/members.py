@@ -179,7 +179,7 @@ def record_command(
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder.record_process import record_session
-    from sites.machine_load import describe_load, measure_busy_share
+    from sites.machine_load import check_machine_load
 
     from ...files import refuse_existing
     from ...log.log_layout import find_parts, parse_channel_filter
@@ -214,7 +214,7 @@ def record_command(
 
     def warn_of_load() -> None:
         """Warns if other programs keep the processors of this machine busy."""
-        warning = describe_load(measure_busy_share(clock))
+        warning = check_machine_load(clock)
         if warning:
             terminal.print_note(warning)
 

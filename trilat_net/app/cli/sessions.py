@@ -625,8 +625,8 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     """
     from trilat_net.app.running_session import RunningSession
 
-    from ...fields import check_finite
     from ...net.requests import ChangeRequest
+    from ...scenario.key_checks import check_finite
 
     session, connection = context.obj
     check_finite(change, "")  # messages cannot hold infinite numbers

@@ -209,7 +209,7 @@ class SearchRange(NamedTuple):
     tolerance: float
 
 
-class MarginItem(NamedTuple):
+class _MarginItem(NamedTuple):
     """Task for a worker process: find the limits of stability at one grid point of a sweep.
 
     The object can be pickled.
@@ -342,7 +342,7 @@ def search_margins(
         # If nothing is random, all seeds give the same result.
         is_random = plan.scenario(*cell_at_low_end.overrides).random
         seeds = plan.seeds if is_random else plan.seeds[:1]
-        searches += [MarginItem(plan, grid_point, seed, within) for seed in seeds]
+        searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
 
     # The workers need the files of control laws that users wrote.
     laws = list_imported_code([plan.base])
@@ -350,7 +350,7 @@ def search_margins(
         return pool.map(_search_margin_task, searches, progress)
 
 
-def _search_margin_task(task: MarginItem) -> GridPointMargin:
+def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
     The function needs nothing but its argument. Therefore any worker process can call it.

@@ -39,7 +39,6 @@ from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.analysis.theory.linear_edge import GrowthColumn, compute_growth_column
 from trilat_net.core.step.vectors import Array
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.fields import is_number
 from trilat_net.laws.adaptive import Adaptive
 from trilat_net.laws.conditions import COMMON_MOTION_SHARE, find_least_reversible
 from trilat_net.laws.p_d import PD
@@ -47,6 +46,7 @@ from trilat_net.scenario import Scenario, SiteSpec
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
+from trilat_net.scenario.key_checks import is_number
 from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
 
 from .fixed_gains import describe_fixed_gains

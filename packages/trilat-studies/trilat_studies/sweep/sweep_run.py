@@ -395,7 +395,7 @@ site tick.
 """
 
 
-def uses_lanes(plan: SweepPlan, runs: int) -> bool:
+def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
     """Returns True if the runs of a sweep are to be computed side by side.
 
     Args:
@@ -601,7 +601,7 @@ def _run_cells(
             for number, seed in runs
             if (number, seed) not in journal.done
         )
-        runs_side_by_side = uses_lanes(plan, run_count - len(journal.done))
+        runs_side_by_side = _uses_lanes(plan, run_count - len(journal.done))
         if runs_side_by_side:
             _compile_lanes(plan)
         journal.run_pending(

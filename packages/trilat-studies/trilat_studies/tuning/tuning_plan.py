@@ -364,7 +364,7 @@ _PROBE_S = 2.0
 """Duration of the run from which the duration of a search is estimated, in s."""
 
 
-class PaperGainsResult(NamedTuple):
+class _PaperGainsResult(NamedTuple):
     """Score of the published gains of the adaptive law, in the scenario of a comparison.
 
     The gains are printed in the paper from which the law comes. The score shows what tuning
@@ -521,7 +521,7 @@ class TuningPlan(NamedTuple):
                 paper_scores += scores
         printed = []
         for name, score in zip(paper_names, paper_scores, strict=True):
-            printed.append(PaperGainsResult(name, paper_scenarios[0][name], score))
+            printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
         return TuningResult(self, searches, printed)
 
     def _build_items(
@@ -561,7 +561,7 @@ class TuningResult(Result):
 
     plan: TuningPlan
     found: list[CandidateSearch]
-    printed: list[PaperGainsResult]
+    printed: list[_PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
         """Yields the parts of the text that `trilat compare --tune` prints.

@@ -1,18 +1,19 @@
 """Writes the sentences about the premises of a stability certificate.
 
-A premise is a condition of the stability theorem, such as constant delays. The package
-`analysis.certificate` computes its quantities, and `describe_premise` states them for people. A
-site is the process that runs one arm.
+A premise is a condition of the stability theorem, such as constant delays. `premises` computes
+its quantities, and the functions in `DESCRIBERS` state them for people. A site is the process
+that runs one arm.
 
 Invariant:
     - A sentence lists at most `MAX_LISTED_NAMES` sites, links or joints, and counts the others.
-    - Each class of `premise_quantities` has one function here, in `_DESCRIBE`.
+    - Each class of `premise_quantities` has one function here, in `DESCRIBERS`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ..analysis.certificate.premise_quantities import (
+from ...errors import count_nouns
+from .premise_quantities import (
     AxisQuantities,
     BookedTorqueQuantities,
     BooksQuantities,
@@ -26,7 +27,6 @@ from ..analysis.certificate.premise_quantities import (
     OperatorQuantities,
     ParameterFault,
     ParameterQuantities,
-    PremiseQuantities,
     PresenceQuantities,
     PresentStretch,
     RecordQuantities,
@@ -36,8 +36,6 @@ from ..analysis.certificate.premise_quantities import (
     TorqueQuantities,
     WallQuantities,
 )
-from ..analysis.certificate.premises import Evidence
-from ..errors import count_nouns
 
 MAX_LISTED_NAMES = 4
 """Largest number of links or sites that a sentence names."""
@@ -54,15 +52,6 @@ _PARAMETER_FAULTS = {
     ParameterFault.NEVER_LEARNT: "a parameter is neither learnt nor known",
     ParameterFault.FRICTION: "the law does not compensate all friction of the joints",
 }
-
-
-def describe_premise(quantities: PremiseQuantities) -> str:
-    """Returns the evidence for or against a premise as a sentence.
-
-    Args:
-        quantities: Quantities of the premise.
-    """
-    return _DESCRIBE[type(quantities)](quantities)
 
 
 def describe_missing_functionals(missing: Sequence[MissingFunctional]) -> str:
@@ -95,39 +84,6 @@ def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
     return (
         f"{group_texts} follow nobody outside: beta is not unique, certify each group by itself"
     )
-
-
-def describe_evidence(evidence: Evidence) -> str:
-    """Returns a sentence on how many records exist, and whether the log is unchanged.
-
-    Args:
-        evidence: How complete and how authentic the records of a run are.
-    """
-    return f"{evidence.coverage.describe(evidence.min_coverage)}; {evidence.integrity.text}"
-
-
-def list_evidence_faults(evidence: Evidence) -> list[str]:
-    """Lists the reasons why the records do not suffice to judge a run, a sentence for each.
-
-    Args:
-        evidence: How complete and how authentic the records are.
-
-    Returns:
-        The sentences. Empty if the records suffice.
-    """
-    least = evidence.min_coverage
-    reasons = []
-    if not evidence.integrity.passed:
-        reasons.append(f"the log is not as it was made: {evidence.integrity.text}")
-    if evidence.coverage.share < least:
-        reasons.append(f"records are missing: {evidence.coverage.describe(least)}")
-    share = evidence.functional_share
-    if share is not None and share < least:
-        reasons.append(f"V is judged over {100.0 * share:.4g} % of its periods")
-    if evidence.unmet:
-        sites = " and ".join(evidence.unmet)
-        reasons.append(f"{sites}, as recorded, did not react to this run")
-    return reasons
 
 
 def _describe_law(quantities: LawQuantities) -> str:
@@ -342,7 +298,7 @@ def _describe_sampling(quantities: SamplingQuantities) -> str:
     return f"the arm of {quantities.site} got {energy}, between ticks"
 
 
-_DESCRIBE: dict[type, Callable[[Any], str]] = {
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
     LawQuantities: _describe_law,
     ParameterQuantities: _describe_parameters,
     GainQuantities: _describe_gains,

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.links.delay import DelayKind, TraceEnd
-from .delay_models import LinkBase
-from .scenario_types import Scenario, scheduled_links
+from ..scenario.delay_models import LinkBase
+from ..scenario.scenario_types import Scenario, scheduled_links
 
 MAX_PERIOD_TICKS = 400_000
 """Longest true period that is analysed, in ticks of the fastest site."""
@@ -117,7 +117,7 @@ def _find_near_period_s(
     return float(spans_s[first_match])
 
 
-class DelayPeriod(NamedTuple):
+class _DelayPeriod(NamedTuple):
     """The period after which the delays of all links and the ticks of all sites repeat.
 
     Attributes:
@@ -135,7 +135,7 @@ class DelayPeriod(NamedTuple):
         return self.span_s is not None and self.span_s == self.true_s
 
 
-def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> DelayPeriod:
+def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _DelayPeriod:
     """Finds the period after which the delays of links and the ticks of sites repeat.
 
     A tick is one period of a site's control loop. The true period is the least common multiple
@@ -151,13 +151,13 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> Del
     """
     for link in links:
         if link.random or link.measured or is_ending_trace(link):
-            return DelayPeriod(None, None)
+            return _DelayPeriod(None, None)
     cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
     true_period = _find_common_period(cycles, math.gcd(*rates_hz))
     true_s = float(true_period)
     if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:
-        return DelayPeriod(true_s, true_s)
-    return DelayPeriod(true_s, _find_near_period_s(cycles, rates_hz))
+        return _DelayPeriod(true_s, true_s)
+    return _DelayPeriod(true_s, _find_near_period_s(cycles, rates_hz))
 
 
 def is_ending_trace(link: LinkBase) -> bool:
@@ -184,7 +184,7 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     return link
 
 
-def find_final_delay_period(scenario: Scenario) -> DelayPeriod:
+def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
     """Finds the period of all delays and ticks that are in force at the end of a scenario.
 
     Args:
