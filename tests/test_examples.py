@@ -15,12 +15,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from device_tests.devices import CapReports, HaplyService
 from trilat_ros2.ros2_bridge import refuse_other_robots
 
 import trilat_net
 from tests.log_editing import recorded
 from tests.net.waiting import until
+from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.app.running_session import open_hand

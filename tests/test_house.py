@@ -53,8 +53,8 @@ INTERFACE_LIMITS = {  # part: how many of its names other parts import
     "analysis": 120,
     "app": 68,
     "studies": 9,
-    "people": 19,
-    "ros2": 31,
+    "people": 9,
+    "ros2": 28,
 }
 """A number here only falls; `python -m tests.part_interfaces --count` prints them."""
 TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
@@ -158,7 +158,7 @@ def test_every_import_between_rooms_has_its_reason() -> None:
     assert all(row["what for"] for row in rows)
     told = {(row["package"], row["imports"]) for row in rows}
     assert told == house.room_imports()
-    assert len(told) <= 102  # two of them are what packages of others may use
+    assert len(told) <= 113  # two of them are what packages of others may use
 
 
 @pytest.mark.push

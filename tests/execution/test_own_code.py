@@ -16,8 +16,8 @@ from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_scenario
 from trilat_net.log.log_reader import Log
+from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.imported_code import allowed_code
 from trilat_net.scenario.operators.program_hand import HandPlayer, find_own_hand
 from trilat_net.scenario.plant_player import make_plant_players
 

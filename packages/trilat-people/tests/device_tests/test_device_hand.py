@@ -12,6 +12,7 @@ import pytest
 from trilat_people.devices.haply_inverse3 import SILENCE_S
 
 from tests.documentation import find_blocks
+from tests.sites.devices import ZERO, ScriptedDevice
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import Session, reached
 from trilat_net.app.input_device import DeviceState
@@ -21,8 +22,6 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
-
-from .devices import ZERO, ScriptedDevice
 
 Script = Callable[[float], DeviceState]
 HELD = {"a": True, "b": False}

@@ -14,10 +14,9 @@ from trilat_people.devices.spacemouse import SpaceMouse, find_spacemouse
 from tests.cli.running import trilat
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
+from tests.sites.devices import ZERO, CapReports, HaplyService
 from trilat_net.app.input_device import Device, DeviceState
 from trilat_net.errors import UsageError
-
-from .devices import ZERO, CapReports, HaplyService
 
 FORCE = (0.5, -1.0, 1.5)
 

@@ -10,10 +10,9 @@ import pytest
 from trilat_people.experiment.experiment_run import begin_experiment
 
 import trilat_net as tn
+from tests.experiments import REACH, answer_form, write_hurried_pair, write_protocol
 from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
-
-from .experiments import REACH, answer_form, write_hurried_pair, write_protocol
 
 
 @pytest.fixture(scope="module")

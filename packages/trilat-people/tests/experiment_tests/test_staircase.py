@@ -12,9 +12,8 @@ from trilat_people.experiment.experiment_run import Experiment, begin_experiment
 from trilat_people.experiment.staircase import Staircase
 
 import trilat_net as tn
+from tests.experiments import write_protocol
 from trilat_net.errors import UsageError
-
-from .experiments import write_protocol
 
 SHORT = 'kind = "track"\nduration_s = 0.2'
 STAIRS = '\n[staircase]\nkey = "control.K"\nstandard = 100.0\nstart = 80.0\n'

@@ -12,11 +12,10 @@ from trilat_people.experiment.tasks import ContactTrial, ReachTrial, TrackTrial
 from trilat_people.experiment.trial_run import ExperimentTrial, TrialJudge
 
 import trilat_net as tn
+from tests.experiments import APART, CONTACT, HANDOVER, REACH, TRACK, write_protocol
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-
-from .experiments import APART, CONTACT, HANDOVER, REACH, TRACK, write_protocol
 
 PAIR = '["m1", "m2"]'
 TRAINING = """

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from device_tests.devices import HaplyService, Vector
 
 from tests.live.processes import PAPER, Process, Session, Stage, connections
 from tests.net.waiting import until
+from tests.sites.devices import HaplyService, Vector
 from trilat_net.log.log_reader import Log
 
 HANDS = 'sites.m1.hands=[{kind="live", device={force_limit_n=1.5}}]'

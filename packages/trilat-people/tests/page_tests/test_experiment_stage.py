@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from experiment_tests.experiments import APART, REACH, write_protocol
 from trilat_people.experiment.experiment_analysis import analyse_experiment
 from trilat_people.experiment.experiment_run import (
     Experiment,
@@ -23,6 +22,7 @@ from trilat_people.live_page.experiment_stage import (
 from trilat_people.live_page.page_orders import AbortTrial, DoStep
 from trilat_people.live_page.page_server import PageServer
 
+from tests.experiments import APART, REACH, write_protocol
 from tests.live.page_client import page_client, with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock

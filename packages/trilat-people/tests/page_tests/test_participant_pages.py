@@ -6,11 +6,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from experiment_tests.experiments import write_protocol
 from playwright.sync_api import Browser, Page, WebSocketRoute
 from trilat_people.experiment.experiment_run import begin_experiment
 from trilat_people.live_page.experiment_stage import Stage
 
+from tests.experiments import write_protocol
 from tests.live.browsers import needs_browser
 from tests.live.page_client import with_query
 from tests.net.manual_clock import ManualClock

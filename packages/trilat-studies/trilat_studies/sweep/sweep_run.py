@@ -29,8 +29,8 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net.clock import SystemClock
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.laws import identify_law
 from trilat_net.work import executor
 from trilat_net.work.study_folder import (
