@@ -74,7 +74,7 @@ class LineFigures:
 def list_sources() -> list[Path]:
     """Returns the source files of the program, in order, without the tests of its packages."""
     paths = (path for top in SOURCES for path in (house.ROOT / top).rglob("*.py"))
-    return sorted(path for path in paths if "tests" not in path.parts)
+    return sorted(path for path in paths if "tests" not in path.relative_to(house.ROOT).parts)
 
 
 def find_part(path: Path) -> str:

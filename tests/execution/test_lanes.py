@@ -92,7 +92,7 @@ def check_cells(cells: Sequence[Scenario]) -> None:
 
 @pytest.mark.parametrize("structure", STRUCTURES[:3], ids=lambda structure: structure[0])
 @pytest.mark.parametrize("count", [LANES, 5])
-def test_every_lane_has_the_bits_of_its_run_alone(
+def test_lanes_have_the_bits_of_single_runs(
     structure: tuple[str, dict[str, Any]], count: int
 ) -> None:
     check_cells(draw_cells(random.Random(count), structure, count))
@@ -100,7 +100,7 @@ def test_every_lane_has_the_bits_of_its_run_alone(
 
 @pytest.mark.long
 @pytest.mark.parametrize("cells", [400, 2000])
-def test_random_cells_have_the_bits_of_their_runs_alone(cells: int) -> None:
+def test_random_cells_have_single_run_bits(cells: int) -> None:
     draws = random.Random(cells)
     while cells > 0:
         count = draws.randint(1, LANES)
@@ -168,7 +168,7 @@ def test_obstacles_are_named(name: str, settings: dict[str, Any], obstacle: str)
     assert obstacle in find_obstacle(run)
 
 
-def test_groups_have_one_structure_and_few_runs_stay_alone() -> None:
+def test_groups_share_structure_and_small_groups_split() -> None:
     free = [FusedRun(load_scenario("free", {"duration_s": 0.1})) for _ in range(LANES + 1)]
     longer = [
         FusedRun(load_scenario("free", {"duration_s": 0.2})) for _ in range(LEAST_RUNS - 1)

@@ -106,7 +106,7 @@ def test_untouched_sliders_are_empty_and_sent_as_missing(
 
 
 @pytest.mark.parametrize("screen", SCREENS)
-def test_a_touched_slider_is_placed_where_it_is_pressed(
+def test_touched_sliders_are_placed_where_pressed(
     address: str, browser: Browser, asked: dict[str, Json], screen: str
 ) -> None:
     with form_page(browser, address, asked["tlx"], screen) as (page, _):
@@ -119,7 +119,7 @@ def test_a_touched_slider_is_placed_where_it_is_pressed(
 
 
 @pytest.mark.parametrize("screen", SCREENS)
-def test_choices_that_nobody_makes_are_missing(
+def test_unmade_choices_are_missing(
     address: str, browser: Browser, asked: dict[str, Json], screen: str
 ) -> None:
     with form_page(browser, address, asked["trust"], screen) as (page, sent):

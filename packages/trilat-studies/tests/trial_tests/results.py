@@ -1,4 +1,4 @@
-"""A scenario that takes milliseconds, and figures and results as a trial would have given them."""
+"""A scenario that takes milliseconds, and figures and results as a trial would return them."""
 
 from typing import Any
 
