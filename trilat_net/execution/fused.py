@@ -253,6 +253,10 @@ class RunMemory(NamedTuple):
         peaks: Peaks in intervals of 50 ms, see `run_until`.
         sums: Sums over the records, shape (N,), see `SumsRow`.
         settled_rad: Position error below which an arm counts as settled, rad.
+        laws: Numbers of compiled laws that are not a part of the kernel. None if no site has
+            such a law.
+        compiled_laws: These laws, by the index of their site.
+        has_plain_law: True if a site has a law in plain Python.
     """
 
     tables: SiteArrays
@@ -262,6 +266,9 @@ class RunMemory(NamedTuple):
     peaks: Array
     sums: RowArray
     settled_rad: float
+    laws: LawArrays | None
+    compiled_laws: Mapping[int, CompiledLaw]
+    has_plain_law: bool
 
 
 class FusedRun:
@@ -450,6 +457,11 @@ class FusedRun:
             peaks=self._peaks,
             sums=self._sums,
             settled_rad=self._settled_rad,
+            laws=self._law_arrays,
+            compiled_laws={
+                i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)
+            },
+            has_plain_law=any(isinstance(law, PlainLaw) for law in self._laws.values()),
         )
 
     def _update_links(self) -> None:

@@ -98,7 +98,7 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
 
 
 @leaf
-def _adapts(s: SiteRow) -> bool:
+def adapts(s: SiteRow) -> bool:
     """Returns True if the estimate adapts in the present mode.
 
     It does not adapt in DIVERGED, and at rest only while the law's own torque is in use.
@@ -125,8 +125,8 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
             overwritten with the sum of both; stage 8 sets it anew.
         chain: Rows of the chain, or None.
     """
-    # `_adapts` is evaluated last, because it is the costly condition.
-    if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
+    # `adapts` is evaluated last, because it is the costly condition.
+    if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not adapts(s):
         return
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -303,6 +303,50 @@ def _advance_arm(
 
 
 @leaf
+def hold_torque(k: int, s: SiteRow) -> None:
+    """Begins stage 8: computes the torque that is held over the period.
+
+    It is the torque of the middle of the period, extrapolated linearly:
+
+        u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
+
+    At the first tick, and under DIGITAL, u = tau_k.
+
+    Args:
+        k: The tick.
+        s: Row of the site; `u` and `q_before` are written.
+    """
+    for i in range(s.q.shape[0]):
+        s.q_before[i] = s.q[i]
+    if s.external != 0:
+        return
+    for i in range(s.u.shape[0]):
+        torque = s.tau[i]
+        if s.scheme != _DIGITAL and k > s.first:
+            extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
+            torque = control.limit_torque(extrapolated, s.tau_limit[i])
+        s.u[i] = torque + s.held[i]
+
+
+@leaf
+def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
+    """Ends stage 8: keeps numbers of this tick for the next one.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        is_adapting: What `adapts` returned before the arm moved.
+    """
+    h_s = 1.0 / s.rate_hz
+    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
+        _advance_estimate(s, chain, h_s, s.Yr)
+    for i in range(s.tau.shape[0]):
+        s.tau_before[i] = s.tau[i]
+    for p in range(s.Yr.shape[0]):
+        s.Yr_before[p] = s.Yr[p] if is_adapting and s.mode != _DIVERGED else 0.0
+
+
+@leaf
 def _advance(
     k: int,
     t_ns: int,
@@ -312,12 +356,6 @@ def _advance(
     table: TorqueTable,
 ) -> None:
     """Runs stage 8: advances the state from t_k to t_{k+1}, and keeps numbers for tick k+1.
-
-    The torque that is held over the period is that of its middle, extrapolated linearly:
-
-        u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
-
-    At the first tick, and under DIGITAL, u = tau_k.
 
     Args:
         k: The tick.
@@ -329,27 +367,15 @@ def _advance(
     """
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
-    adapts = _adapts(s)
-    for i in range(s.q.shape[0]):
-        s.q_before[i] = s.q[i]
+    is_adapting = adapts(s)
+    hold_torque(k, s)
     if s.external == 0:
-        for i in range(s.u.shape[0]):
-            torque = s.tau[i]
-            if s.scheme != _DIGITAL and k > s.first:
-                extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
-                torque = control.limit_torque(extrapolated, s.tau_limit[i])
-            s.u[i] = torque + s.held[i]
         is_finite = _advance_arm(
             t_s=t_ns * 1e-9, h_s=h_s, s=s, chain=chain, actors=actors, table=table
         )
         if not is_finite:
             s.mode = _DIVERGED
-    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and adapts and s.mode != _DIVERGED:
-        _advance_estimate(s, chain, h_s, s.Yr)
-    for i in range(s.tau.shape[0]):
-        s.tau_before[i] = s.tau[i]
-    for p in range(s.Yr.shape[0]):
-        s.Yr_before[p] = s.Yr[p] if adapts and s.mode != _DIVERGED else 0.0
+    finish_advance(s, chain, is_adapting)
 
 
 @leaf
@@ -537,6 +563,29 @@ def sense_stages(
 
 
 @leaf
+def emit_stages(k: int, t_ns: int, s: SiteRow, chain: RowArray | None, record: Array) -> None:
+    """Limits the torque of the law, and writes the record (stages 6 and 7).
+
+    If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the rule
+    `glide` the arm comes to rest instead, see `session_life`.
+
+    Args:
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        s: State of the site (the process that runs the arm), with the torque of the law;
+            written.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        record: Receives the floating-point numbers of the record, the results of the tick.
+    """
+    _guard_torque(k, t_ns, s, chain)
+    for i in range(s.joints):
+        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
+            s.mode = _DIVERGED
+    # 7 emit
+    _write_record(s, record)
+
+
+@leaf
 def act_stages(
     k: int,
     t_ns: int,
@@ -549,8 +598,7 @@ def act_stages(
     """Computes the part of a control period that follows the control law.
 
     The torque is limited, the record is written, and the arm moves to the next period (stages 6
-    to 8). If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the
-    rule `glide` the arm comes to rest instead, see `session_life`.
+    to 8). See `emit_stages` for a joint that is faster than its limit.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -563,12 +611,7 @@ def act_stages(
         record: Receives the floating-point numbers of the record, the results of the tick.
     """
     s: SiteRow = site[0]
-    _guard_torque(k, t_ns, s, chain)
-    for i in range(s.joints):
-        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
-            s.mode = _DIVERGED
-    # 7 emit
-    _write_record(s, record)
+    emit_stages(k=k, t_ns=t_ns, s=s, chain=chain, record=record)
     # 8 advance
     if s.mode != _DIVERGED:
         _advance(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)

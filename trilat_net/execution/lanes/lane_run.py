@@ -23,15 +23,15 @@ from ..fused import FusedRun
 from .lane_deliveries import (
     BLOCK_TICKS,
     copy_link_states,
+    find_draw_addresses,
+    keep_link_states,
     repeat_deliveries,
     use_samples,
 )
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
-from .lane_stages import JOINTS, EndedRuns, advance_site, run_block
+from .lane_stages import JOINTS, STAGES_DTYPE, STATE_WIDTH, EndedRuns, advance_site, run_block
 from .lane_structure import RunStructure, SiteStructure, find_structure
 
-_STATE_DTYPE = np.dtype([(name, "f8", (JOINTS,)) for name in ("q", "qd", "tau_x")])
-"""Layout of the state that a site sends to its peers."""
 _REFERENCE_FIELDS = ("alpha", "alpha_rate", "gone")
 """Fields of a link's row that stage 3 of a tick writes."""
 _STATE_FIELDS = ("q", "qd", "tau_x")
@@ -48,11 +48,10 @@ class SiteTables(NamedTuple):
         environments: The rows of its environments.
         ramps: Row with the changes of its dominance factors.
         record: Row with the floats of its record.
-        states: The latest states of all sites.
-        used: Samples in use in the ticks of a block.
         peaks: Peaks, one row per bucket.
         sums: Row of its sums.
         progress: Row of its progress.
+        scratch: Row with room for the stages of the integrator.
     """
 
     site: Any
@@ -61,11 +60,10 @@ class SiteTables(NamedTuple):
     environments: Any
     ramps: Any
     record: Any
-    states: Any
-    used: Any
     peaks: Any
     sums: Any
     progress: Any
+    scratch: Any
 
 
 class LaneLayout(NamedTuple):
@@ -127,16 +125,17 @@ def list_argument_types(
         environments=LaneTable(layout.actor, environments),
         ramps=LaneTable(np.dtype([("rows", "f8", layout.ramps)])),
         record=LaneTable(np.dtype([("floats", "f8", (layout.floats,))])),
-        states=LaneTable(_STATE_DTYPE),
-        used=LaneTable(np.dtype([("sample", "i8", (structure.peers,))])),
         peaks=LaneTable(np.dtype([("joints", "f8", (layout.columns,))])),
         sums=LaneTable(layout.sums, ((("first_environment", first),),)),
         progress=LaneTable(layout.progress),
+        scratch=LaneTable(STAGES_DTYPE),
     )
     integer = types.int64
     numbers = (integer, integer, integer, types.float64, integer, integer, integer, integer)
+    states = types.Array(types.float64, 4, "C")
+    used = types.Array(types.int64, 3, "C")
     table = types.Array(types.float64, 2, "C")
-    return (*numbers, *tables, table)
+    return (*numbers, *tables, states, used, table)
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
@@ -220,13 +219,16 @@ class LaneRun:
         self._rate_hz = int(first.site["rate_hz"][0, 0])
         self._table = first.table
         self._ticks = 0
-        self._deliveries = [copy_link_states(arrays) for arrays in tables]
+        self._deliveries = copy_link_states(tables)
+        self._draws = find_draw_addresses()
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
 
         # A state waits at most as long as a sample waits in a calendar.
         self._pages = max(arrays.calendars.shape[2] for arrays in tables)
-        self._states = allocate_words(self._sites * (self._pages + 1), 3 * JOINTS)
-        self._used = allocate_words(self._sites * BLOCK_TICKS, structure.peers)
+        # A state occupies a cache line, because each lane needs the state of another tick.
+        self._states = np.zeros((self._sites, self._pages + 1, LANES, STATE_WIDTH))
+        self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
+        self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
 
         def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
@@ -271,18 +273,17 @@ class LaneRun:
         Args:
             tables: Arrays of the sites of each run.
         """
-        states = self._states.reshape(self._sites, self._pages + 1, 3 * JOINTS, LANES)
-        floats = states.view(np.float64)
         for lane, arrays in enumerate(tables):
             for j in range(self._sites):
                 # The peers of a site are all other sites: site 0 is a peer of site 1.
                 receiver = 1 if j == 0 else 0
                 link = arrays.links[receiver, j if j < receiver else j - 1]
                 for n, name in enumerate(_STATE_FIELDS):
-                    floats[j, self._pages, n * JOINTS : (n + 1) * JOINTS, lane] = link[name]
+                    columns = slice(n * JOINTS, (n + 1) * JOINTS)
+                    self._states[j, self._pages, lane, columns] = link[name]
 
     def _find_tables(self) -> IntArray:
-        """Returns the address of each table of each site, shape (N, 11)."""
+        """Returns the address of each table of each site, shape (N, 10)."""
         structure = self._structure
         addresses = []
         for i in range(self._sites):
@@ -295,11 +296,10 @@ class LaneRun:
                 ],
                 ramps=_share(self._ramps, i, self._sites),
                 record=_share(self._records, i, self._sites),
-                states=self._states,
-                used=_share(self._used, i, self._sites),
                 peaks=self._peaks[i],
                 sums=_share(self._sums, i, self._sites),
                 progress=_share(self._progress, i, self._sites),
+                scratch=self._scratch,
             )
             _check_distinct(rows)
             addresses.append([table.ctypes.data for table in rows])
@@ -321,7 +321,6 @@ class LaneRun:
             self.runs[lane].plan([ticks] * self._sites)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
         tables = self._find_tables()
-        used = self._used.reshape(self._sites, BLOCK_TICKS, self._structure.peers, LANES)
         present = EndedRuns(
             ticks=self._ended.ticks,
             site_rows=self._site,
@@ -335,9 +334,15 @@ class LaneRun:
         running = 1
         while self._ticks < ticks and running:
             count = min(BLOCK_TICKS, ticks - self._ticks)
-            for lane in lanes:
-                states = self._deliveries[lane]
-                use_samples(self._ticks, count, self._rate_hz, lane, states, used)
+            use_samples(
+                self._ticks,
+                count,
+                self._rate_hz,
+                self._ended.ticks,
+                self._deliveries,
+                self._draws,
+                self._used,
+            )
             running = run_block(
                 first=self._ticks,
                 count=count,
@@ -348,6 +353,8 @@ class LaneRun:
                 mode_word=mode_offset // 8,
                 addresses=self._addresses,
                 tables=tables,
+                states=self._states,
+                used=self._used,
                 table=self._table,
                 peaks=self._peaks,
                 present=present,
@@ -368,11 +375,12 @@ class LaneRun:
         lanes = list(chosen)
         for lane_table in (
             *(self._site, self._links, self._actors, self._environments, self._sums),
-            *(self._progress, self._ramps, self._records, self._states, self._peaks),
+            *(self._progress, self._ramps, self._records, self._peaks),
         ):
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
+        self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
         self._ended.ticks[:] = -1
-        self._deliveries = [self._deliveries[lane] for lane in lanes]
+        self._deliveries = keep_link_states(self._deliveries, lanes)
         self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
         self.runs = [self.runs[lane] for lane in lanes]
 
@@ -427,11 +435,10 @@ class LaneRun:
         if run.diverged_s is not None:
             run.ran_s = run.diverged_s
         elif not has_ended:
-            states = np.ascontiguousarray(self._states[:, :, lane]).view(np.float64)
             self._links_of_runs[lane].set_pending(
                 ticks=ticks,
                 links=np.ascontiguousarray(self._links[:, :, lane]).view(self._layout.link),
-                states=states.reshape(self._sites, self._pages + 1, 3 * JOINTS),
+                states=self._states[:, :, lane, : 3 * JOINTS].copy(),
             )
 
 

@@ -12,6 +12,9 @@ Invariant:
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from ...core.arms import two_link_stages
 from ...core.arms.exogenous import (
     NO_TORQUE,
     SourceTorque,
@@ -22,9 +25,16 @@ from ...core.arms.exogenous import (
 from ...core.plug.plugged import call_address
 from ...core.step.fused_run import update_peaks, update_sums
 from ...core.step.jit import lane_leaf, leaf, set_lane_form
-from ...core.step.kernel import act_stages, reference_stages, torque_stage
+from ...core.step.kernel import (
+    adapts,
+    emit_stages,
+    finish_advance,
+    hold_torque,
+    reference_stages,
+    torque_stage,
+)
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import Array, IntArray, Vector
+from ...core.step.vectors import Array, IntArray, Pair, Vector, five, pair, put_pair
 from .lane_rows import Words, in_lane, pointer_to, select_row
 
 _DIVERGED = int(Mode.DIVERGED)
@@ -32,6 +42,12 @@ JOINTS = 2
 """Number of joints of the arms that lanes support."""
 TAU_X_COLUMN = 5 * JOINTS
 """Column of tau_x in a record, after q, qd, q_des, qd_des and tau."""
+STATE_WIDTH = 8
+"""Count of numbers that are reserved for a state, q, qd and tau_x: those of a cache line."""
+STAGES_DTYPE = np.dtype(
+    [(name, "f8", (JOINTS,)) for name in ("qdd_1", "qd_2", "qdd_2", "qd_3", "qdd_3")]
+)
+"""Layout of the velocities and accelerations at the first stages of the integrator."""
 
 
 def _no_torque(
@@ -86,6 +102,43 @@ def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]
 set_lane_form(torque_on_arm, _choose_form)
 
 
+@leaf
+def _advance_stage(
+    t_s: float,
+    ahead_s: float,
+    s: Any,
+    qd_before: Pair,
+    qdd_before: Pair,
+    actors: Any,
+    table: TorqueTable,
+) -> tuple[Pair, Pair]:
+    """Evaluates a stage of the integrator, see `two_link_stages.advance_stage`.
+
+    Args:
+        t_s: Time at the beginning of the period, s.
+        ahead_s: Time of the stage after the beginning of the period, s.
+        s: Row of the site.
+        qd_before: Joint velocities at the stage before, rad/s.
+        qdd_before: Joint accelerations at the stage before, rad/s^2.
+        actors: Rows of its operators and environments.
+        table: Their tables.
+    """
+    return two_link_stages.advance_stage(
+        t_s=t_s,
+        ahead_s=ahead_s,
+        q=pair(s.q),
+        qd=pair(s.qd),
+        qd_before=qd_before,
+        qdd_before=qdd_before,
+        u=pair(s.u),
+        theta=five(s.theta),
+        g=s.g,
+        lengths=pair(s.lengths),
+        actors=actors,
+        table=table,
+    )
+
+
 @lane_leaf
 def advance_site(
     k: int,
@@ -102,11 +155,12 @@ def advance_site(
     environments: Any,
     ramps: Any,
     record: Any,
-    states: Any,
-    used: Any,
     peaks: Any,
     sums: Any,
     progress: Any,
+    scratch: Any,
+    states: Array,
+    used: IntArray,
     table: TorqueTable,
 ) -> None:
     """Computes one tick of a site for several runs.
@@ -128,30 +182,29 @@ def advance_site(
         environments: The rows of its environments among them.
         ramps: Row with the changes of its dominance factors.
         record: Row with the floats of its record; written.
-        states: The latest states of all sites. Each site has `pages` rows, and one row for the
-            state before its first tick.
-        used: For each tick of a block, the sample of each peer that is in use; -1: none yet.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
+        scratch: Row with room for the stages of the integrator, see `STAGES_DTYPE`.
+        states: The latest states of all sites, q, qd and tau_x, shape (N, pages + 1, LANES,
+            STATE_WIDTH). The last page holds the state before the first tick.
+        used: Sample in use by peer, lane and tick of a block; -1: none yet.
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
     # 2 release: the state of each peer that is in use
     for lane in range(lanes):
         rows = in_lane(links, lane)
-        samples = in_lane(used, lane)[block_row].sample
         for p in range(rows.shape[0]):
             link = rows[p]
-            sample = samples[p]
+            sample = used[p, lane, block_row]
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
-            state = in_lane(states, lane)[peer * (pages + 1) + page]
             link.used = sample
             for c in range(JOINTS):
-                link.q[c] = state.q[c]
-                link.qd[c] = state.qd[c]
-                link.tau_x[c] = state.tau_x[c]
+                link.q[c] = states[peer, page, lane, c]
+                link.qd[c] = states[peer, page, lane, JOINTS + c]
+                link.tau_x[c] = states[peer, page, lane, 2 * JOINTS + c]
 
     # 3 reference, 4 errors, 5 estimate
     for lane in range(lanes):
@@ -166,24 +219,98 @@ def advance_site(
             chain=None,
         )
 
-    # 6 torque, 7 emit, 8 advance
+    # 6 torque
+    for lane in range(lanes):
+        torque_stage(in_lane(site, lane), None)
+
+    # 6 limits of the torque, 7 emit
     for lane in range(lanes):
         floats = in_lane(record, lane)[0].floats
-        torque_stage(in_lane(site, lane), None)
-        act_stages(
-            k=k,
-            t_ns=t_ns,
-            site=in_lane(site, lane),
+        emit_stages(k=k, t_ns=t_ns, s=in_lane(site, lane)[0], chain=None, record=floats)
+        page = k & (pages - 1)
+        for c in range(JOINTS):
+            states[i, page, lane, c] = floats[c]
+            states[i, page, lane, JOINTS + c] = floats[JOINTS + c]
+            states[i, page, lane, 2 * JOINTS + c] = floats[TAU_X_COLUMN + c]
+
+    # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
+    # processor begins with the next lanes while it waits for results of the previous ones.
+    t_s = t_ns * 1e-9
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        if s.mode != _DIVERGED:
+            hold_torque(k, s)
+        stages = in_lane(scratch, lane)[0]
+        qdd = two_link_stages.find_stage_acceleration(
+            t_s=t_s,
+            q=pair(s.q),
+            qd=pair(s.qd),
+            u=pair(s.u),
+            theta=five(s.theta),
+            g=s.g,
+            lengths=pair(s.lengths),
             actors=in_lane(actors, lane),
             table=table,
-            chain=None,
-            record=floats,
         )
-        state = in_lane(states, lane)[i * (pages + 1) + (k & (pages - 1))]
-        for c in range(JOINTS):
-            state.q[c] = floats[c]
-            state.qd[c] = floats[JOINTS + c]
-            state.tau_x[c] = floats[TAU_X_COLUMN + c]
+        put_pair(stages.qdd_1, qdd)
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        stages = in_lane(scratch, lane)[0]
+        qd, qdd = _advance_stage(
+            t_s=t_s,
+            ahead_s=0.5 * (1.0 / s.rate_hz),
+            s=s,
+            qd_before=pair(s.qd),
+            qdd_before=pair(stages.qdd_1),
+            actors=in_lane(actors, lane),
+            table=table,
+        )
+        put_pair(stages.qd_2, qd)
+        put_pair(stages.qdd_2, qdd)
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        stages = in_lane(scratch, lane)[0]
+        qd, qdd = _advance_stage(
+            t_s=t_s,
+            ahead_s=0.5 * (1.0 / s.rate_hz),
+            s=s,
+            qd_before=pair(stages.qd_2),
+            qdd_before=pair(stages.qdd_2),
+            actors=in_lane(actors, lane),
+            table=table,
+        )
+        put_pair(stages.qd_3, qd)
+        put_pair(stages.qdd_3, qdd)
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        stages = in_lane(scratch, lane)[0]
+        h_s = 1.0 / s.rate_hz
+        qd_4, qdd_4 = _advance_stage(
+            t_s=t_s,
+            ahead_s=h_s,
+            s=s,
+            qd_before=pair(stages.qd_3),
+            qdd_before=pair(stages.qdd_3),
+            actors=in_lane(actors, lane),
+            table=table,
+        )
+        q, qd = two_link_stages.combine_stages(
+            h_s=h_s,
+            q=pair(s.q),
+            qd=pair(s.qd),
+            qd_2=pair(stages.qd_2),
+            qd_3=pair(stages.qd_3),
+            qd_4=qd_4,
+            qdd_1=pair(stages.qdd_1),
+            qdd_2=pair(stages.qdd_2),
+            qdd_3=pair(stages.qdd_3),
+            qdd_4=qdd_4,
+        )
+        if s.mode != _DIVERGED:
+            is_adapting = adapts(s)
+            if not two_link_stages.move_arm(s, q, qd):
+                s.mode = _DIVERGED
+            finish_advance(s, None, is_adapting)
 
     # Statistics of the run.
     for lane in range(lanes):
@@ -303,6 +430,8 @@ def run_block(
     mode_word: int,
     addresses: IntArray,
     tables: IntArray,
+    states: Array,
+    used: IntArray,
     table: Array,
     peaks: Words,
     present: EndedRuns,
@@ -320,7 +449,9 @@ def run_block(
         mode_word: Index of the mode among the words of a site's row.
         addresses: Address of the code of `advance_site` for each site, shape (N,).
         tables: For each site the addresses of its tables, in the order of the arguments of
-            `advance_site`, shape (N, 11).
+            `advance_site`, shape (N, 10).
+        states: The latest states of all sites, see `advance_site`.
+        used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
         table: Tables of the operators and environments.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: The numbers of all runs.
@@ -358,7 +489,8 @@ def run_block(
                     pointer_to(tables[i, 7]),
                     pointer_to(tables[i, 8]),
                     pointer_to(tables[i, 9]),
-                    pointer_to(tables[i, 10]),
+                    states,
+                    used[i],
                     table,
                 ),
             )
