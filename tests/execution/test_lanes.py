@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.execution.varying_links import VARYING_LINKS
+from trilat_net.errors import LawFailed
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.lanes import LANES, LEAST_RUNS, find_obstacle, group_runs
@@ -27,12 +28,20 @@ STRUCTURES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("free", {}),
     ("p_d_margin", {}),
     ("windup", {}),
+    ("two_sites", {"control.law": "wave", "scheme": "digital"}),
+    ("free", {"control.law": "tdpa", "scheme": "digital", "control.B": 5.0}),
+    ("two_sites", {"control.law": "four_channel", "scheme": "digital"}),
     ("free", {"scheme": "digital", "rate_hz": 333}),
     ("asymmetric", {}),
     ("contact", {}),
     ("free", {"sites.s.on_stale": {"action": "hold", "age_ms": 205.0}}),
 )
-"""Scenarios whose runs differ in their equations; the quick tests use the first three."""
+"""Scenarios whose runs differ in their equations; the quick tests use the first four."""
+QUICK = STRUCTURES[:4]
+LAWS = ("tanks", "smith", "authority", "saturated_pd", "pd_d")
+STRUCTURES += tuple(("two_sites", {"control.law": law, "scheme": "digital"}) for law in LAWS)
+GAINS = {"wave": "control.b", "tdpa": "control.K", "four_channel": "control.K"}
+"""A gain of each law that is not a part of the kernel."""
 
 
 def draw_cells(
@@ -42,9 +51,14 @@ def draw_cells(
     name, settings = structure
     base = load_scenario(name, {"duration_s": 0.6, **settings})
     gain = "control.Kd" if name in ("free", "windup", "asymmetric") else "control.d"
+    gain = GAINS.get(settings.get("control.law", ""), gain)
+    has_gain = settings.get("control.law") not in LAWS
+    factor = 10.0 if gain in GAINS.values() else 1.0
     cells = []
     for _ in range(count):
-        numbers = {gain: draws.uniform(0.5, 3.0), "seed": draws.randrange(1000)}
+        numbers: dict[str, float] = {"seed": draws.randrange(1000)}
+        if has_gain:
+            numbers[gain] = factor * draws.uniform(0.5, 3.0)
         cells.append(load_scenario(base, {**draws.choice(LINKS), **numbers}))
     return cells
 
@@ -60,6 +74,8 @@ def read_numbers(run: FusedRun) -> dict[str, bytes]:
         f"progress.{name}": memory.progress[name] for name in memory.progress.dtype.names
     }
     numbers |= {"peaks": memory.peaks, "records": run.records}
+    if memory.laws is not None:
+        numbers |= {"laws": memory.laws.rows, "sent": memory.laws.sent}
     return {name: np.ascontiguousarray(array).tobytes() for name, array in numbers.items()}
 
 
@@ -90,7 +106,7 @@ def check_cells(cells: Sequence[Scenario]) -> None:
         check_equal(run, run_alone(cell))
 
 
-@pytest.mark.parametrize("structure", STRUCTURES[:3], ids=lambda structure: structure[0])
+@pytest.mark.parametrize("structure", QUICK, ids=lambda structure: structure[0])
 @pytest.mark.parametrize("count", [LANES, 5])
 def test_every_lane_has_the_bits_of_its_run_alone(
     structure: tuple[str, dict[str, Any]], count: int
@@ -98,14 +114,22 @@ def test_every_lane_has_the_bits_of_its_run_alone(
     check_cells(draw_cells(random.Random(count), structure, count))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("cells", [400, 2000])
-def test_random_cells_have_the_bits_of_their_runs_alone(cells: int) -> None:
+def check_random_cells(structures: Sequence[tuple[str, dict[str, Any]]], cells: int) -> None:
+    """Checks so many cells of random structures, in groups of random sizes."""
     draws = random.Random(cells)
     while cells > 0:
         count = draws.randint(1, LANES)
-        check_cells(draw_cells(draws, draws.choice(STRUCTURES), count))
+        check_cells(draw_cells(draws, draws.choice(structures), count))
         cells -= count
+
+
+def test_400_random_cells_have_the_bits_of_their_runs_alone() -> None:
+    check_random_cells(QUICK, 400)
+
+
+@pytest.mark.long
+def test_2000_random_cells_have_the_bits_of_their_runs_alone() -> None:
+    check_random_cells(STRUCTURES, 2000)
 
 
 def test_lane_has_the_bits_of_site_step() -> None:
@@ -153,11 +177,29 @@ def test_runs_continue_in_lanes_or_alone() -> None:
         assert (runs[index].memory.next_samples == alone.memory.next_samples).all()
 
 
+def test_only_the_run_whose_law_fails_ends() -> None:
+    """Some laws of users fail in a tick of their own, if the numbers of their run say so."""
+    line = {"law": "tests.plugged_laws:CompiledLine"}
+    base = load_scenario("asymmetric", {"link.delay_ms": 5.0, "duration_s": 0.2})
+    cells = [
+        load_scenario(base, {"sites.m2.control": {**line, "K": 15.0 + n, "fail_at": fail_at}})
+        for n, fail_at in enumerate([-1, -1, 150, -1, 42])
+    ]
+    runs = [FusedRun(cell) for cell in cells]
+    (group,) = group_runs(runs)
+    group.advance_to(0.03)
+    for run, cell in zip(runs, cells, strict=True):
+        check_equal(run, run_alone(cell, 0.03))
+    with pytest.raises(LawFailed, match="m2 failed at tick 149: ZeroDivisionError"):
+        group.advance_to(0.2)
+    for run, cell in zip(runs[:2], cells[:2], strict=True):
+        check_equal(run, run_alone(cell, 0.03, 0.2))
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "obstacle"),
     [
         ("six_joints", {}, "arms that are chains of joints"),
-        ("free", {"control.law": "tdpa", "scheme": "digital"}, "laws that the kernel"),
         ("free", {"sites.s.rate_hz": 500}, "tick rates that differ"),
         ("play", {}, "hands that move an arm live"),
         ("free", {"sites.s.on_stale": {"action": "glide"}}, "glide"),

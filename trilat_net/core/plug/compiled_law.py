@@ -194,7 +194,8 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
     return np.dtype((np.record, layout))
 
 
-@register_jitable(**CHECKED)
+# Numba cannot return a record from a function, so the code becomes a part of each caller.
+@numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
 def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
     """Returns the input of a control law in a tick. Nothing is copied.
 

@@ -726,14 +726,27 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
     return _make_leaf(function, _LaneCompiler)
 
 
+@cache
+def _make_unstored(function: Callable[..., Any]) -> Any:
+    """Returns Numba's dispatcher of a function of lanes whose code is not stored on disk."""
+    dispatcher: Any = _make_leaf(function, _LaneCompiler)
+    dispatcher._cache = NullCache()
+    return dispatcher
+
+
 def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
     """Compiles a function of lanes, or loads its code, and returns the address of its code.
+
+    The code is not stored on disk if the attribute `is_stored` of some type is False.
 
     Args:
         function: A function with the decorator `lane_leaf`.
         argument_types: Numba's types of its arguments.
     """
     dispatcher: Any = function
+    is_stored = all(getattr(kind, "is_stored", True) for kind in argument_types)
+    if not is_stored:
+        dispatcher = _make_unstored(dispatcher.py_func)
     dispatcher.compile(argument_types)
     result = dispatcher.overloads[argument_types]
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
@@ -748,8 +761,7 @@ def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, 
     """
     dispatcher: Any = function
     # Numba has no text of code from the cache.
-    compiled: Any = _make_leaf(dispatcher.py_func, _LaneCompiler)
-    compiled._cache = NullCache()
+    compiled = _make_unstored(dispatcher.py_func)
     compiled.compile(argument_types)
     return str(compiled.overloads[argument_types].library.get_asm_str())
 

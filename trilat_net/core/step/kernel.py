@@ -303,7 +303,7 @@ def _advance_arm(
 
 
 @leaf
-def hold_torque(k: int, s: SiteRow) -> None:
+def hold_motor_torque(k: int, s: SiteRow) -> None:
     """Begins stage 8: computes the torque that is held over the period.
 
     It is the torque of the middle of the period, extrapolated linearly:
@@ -368,7 +368,7 @@ def _advance(
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
     is_adapting = adapts(s)
-    hold_torque(k, s)
+    hold_motor_torque(k, s)
     if s.external == 0:
         is_finite = _advance_arm(
             t_s=t_ns * 1e-9, h_s=h_s, s=s, chain=chain, actors=actors, table=table

@@ -32,10 +32,11 @@ from ...core.links.delay import (
     clamp_delay_us,
     draw_delay_us,
 )
-from ...core.links.link import LinkArrays, accept_sample, release_sample
+from ...core.links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
 from ...core.links.philox import DrawKey, uniforms
 from ...core.plug.plugged import call_address
 from ...core.step.jit import find_lane_address, lane_leaf, leaf
+from ...core.step.kernel import channel_of
 from ...core.step.row_fields import LinkRow
 from ...core.step.site_arrays import SiteArrays
 from ...core.step.ticks import first_tick_at, tick_ns
@@ -394,7 +395,7 @@ def use_samples(
     states: LinkStates,
     draws: DrawAddresses,
     used: IntArray,
-) -> None:
+) -> int:
     """Finds which sample of each peer every site of several runs uses, for a block of ticks.
 
     Args:
@@ -406,7 +407,12 @@ def use_samples(
         draws: Functions that draw random numbers.
         used: Receives the index of the sample, or -1 before the first one, shape (N, P, LANES,
             ticks).
+
+    Returns:
+        The largest age of a sample in use, ticks. Before the first sample, it is the age that
+        the first sample would have.
     """
+    largest_age = 0
     has_whole_period = 1_000_000_000 % rate_hz == 0
     first_sample = max(first - 1, 0)
     for index in range(count):
@@ -437,6 +443,10 @@ def use_samples(
                         used=used[i, p, lane],
                     )
                 states.newest[lane, i, p] = newest
+                for index in range(count):
+                    age = first + index - used[i, p, lane, index]
+                    largest_age = max(largest_age, age)
+    return largest_age
 
 
 @leaf
@@ -449,6 +459,8 @@ def repeat_deliveries(
     dues: IntArray,
     calendars: RowArray,
     points: Points,
+    channel: ChannelArrays | None,
+    joints: int,
     states: Array,
 ) -> None:
     """Executes the links of a run for some ticks, without the arms.
@@ -465,12 +477,12 @@ def repeat_deliveries(
         dues: Due times, shape (N, P, D); changed.
         calendars: Calendars of the links, shape (N, P, pages); changed.
         points: Traces and outages.
-        states: The latest states of the sites, q, qd and tau_x, shape (N, R + 1, 6). The state
-            of tick k is at k modulo R. R is a power of two.
+        channel: Numbers that laws receive, or None.
+        joints: Number of joints.
+        states: The latest states of the sites, q, qd, tau_x and the numbers that the law sent,
+            shape (N, R + 1, width). The state of tick k is at k modulo R. R is a power of two.
     """
     mask = states.shape[1] - 2
-    nothing = states[0, 0, :0]
-    joints = states.shape[2] // 3
     for k in range(first, end):
         for i in range(links.shape[0]):
             for p in range(links.shape[1]):
@@ -480,7 +492,7 @@ def repeat_deliveries(
                     dues=dues[i, p],
                     calendar=calendars[i, p],
                     points=points,
-                    channel=None,
+                    channel=channel_of(channel_of(channel, i), p),
                 )
                 if k > 0:
                     peer = p if p < i else p + 1
@@ -492,7 +504,7 @@ def repeat_deliveries(
                         q=state,
                         qd=state[joints:],
                         tau_x=state[2 * joints :],
-                        sent=nothing,
+                        sent=state[3 * joints :],
                         link=link,
                     )
                 release_sample(k, rate_hz, link)

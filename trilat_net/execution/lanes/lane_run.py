@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba.core import types
+from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
 from ...core.step.fused_run import NEVER_NS
 from ...core.step.jit import find_lane_address, read_lane_assembly
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import IntArray
-from ..fused import FusedRun
+from ...core.step.vectors import Array, IntArray
+from ..fused import FusedRun, RunMemory
 from .lane_deliveries import (
     BLOCK_TICKS,
     copy_link_states,
@@ -28,10 +29,13 @@ from .lane_deliveries import (
     repeat_deliveries,
     use_samples,
 )
+from .lane_laws import LawCode
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
-from .lane_stages import JOINTS, STAGES_DTYPE, STATE_WIDTH, EndedRuns, advance_site, run_block
+from .lane_stages import JOINTS, STAGES_DTYPE, EndedRuns, advance_site, run_block
 from .lane_structure import RunStructure, SiteStructure, find_structure
 
+_FIRST_PAGES = 256
+"""Number of ticks whose states are kept at first, a power of two."""
 _REFERENCE_FIELDS = ("alpha", "alpha_rate", "gone")
 """Fields of a link's row that stage 3 of a tick writes."""
 _STATE_FIELDS = ("q", "qd", "tau_x")
@@ -52,6 +56,10 @@ class SiteTables(NamedTuple):
         sums: Row of its sums.
         progress: Row of its progress.
         scratch: Row with room for the stages of the integrator.
+        law: Row with the numbers of its compiled law.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that its law sends.
+        code: Stands for the code of the law. The table itself is not used.
     """
 
     site: Any
@@ -64,6 +72,10 @@ class SiteTables(NamedTuple):
     sums: Any
     progress: Any
     scratch: Any
+    law: Any
+    received: Any
+    sent: Any
+    code: Any
 
 
 class LaneLayout(NamedTuple):
@@ -78,6 +90,9 @@ class LaneLayout(NamedTuple):
         floats: Number of floats in a record.
         columns: Number of columns of the peaks.
         ramps: Shape of the table of dominance factors.
+        law: Largest count of numbers of a compiled law.
+        received: Largest count of numbers that a law receives from a peer.
+        sent: Largest count of numbers that a law sends.
     """
 
     site: np.dtype[Any]
@@ -88,6 +103,9 @@ class LaneLayout(NamedTuple):
     floats: int
     columns: int
     ramps: tuple[int, ...]
+    law: int
+    received: int
+    sent: int
 
 
 def find_layout(run: FusedRun) -> LaneLayout:
@@ -103,6 +121,9 @@ def find_layout(run: FusedRun) -> LaneLayout:
         floats=memory.sent.rows.shape[2],
         columns=memory.peaks.shape[2],
         ramps=tables.ramps.shape[1:],
+        law=0 if memory.laws is None else memory.laws.rows.shape[1],
+        received=0 if tables.channel is None else tables.channel.received.shape[2],
+        sent=0 if memory.laws is None else memory.laws.sent.shape[1],
     )
 
 
@@ -129,13 +150,60 @@ def list_argument_types(
         sums=LaneTable(layout.sums, ((("first_environment", first),),)),
         progress=LaneTable(layout.progress),
         scratch=LaneTable(STAGES_DTYPE),
+        law=_type_numbers(layout.law, 1),
+        received=_type_numbers(layout.received, structure.peers),
+        sent=_type_numbers(layout.sent, 1),
+        code=LawCode(site.law),
     )
     integer = types.int64
     numbers = (integer, integer, integer, types.float64, integer, integer, integer, integer)
     states = types.Array(types.float64, 4, "C")
     used = types.Array(types.int64, 3, "C")
+    columns = types.Array(types.int64, 2, "C")
     table = types.Array(types.float64, 2, "C")
-    return (*numbers, *tables, states, used, table)
+    return (*numbers, *tables, states, used, columns, table)
+
+
+def _type_numbers(count: int, rows: int) -> LaneTable:
+    """Returns Numba's type of a table whose rows contain one vector, `numbers`.
+
+    Args:
+        count: Count of numbers.
+        rows: Number of rows.
+    """
+    return LaneTable(np.dtype([("numbers", "f8", (count,))]), ((),) * rows)
+
+
+def _find_addresses(run: FusedRun, structure: RunStructure) -> IntArray:
+    """Compiles the code of each site of a run, or loads it, and returns its addresses.
+
+    Raises:
+        NumbaError: A law of a user cannot be compiled in lanes.
+    """
+    layout = find_layout(run)
+    addresses = []
+    for site in structure.sites:
+        arguments = list_argument_types(layout, structure, site)
+        addresses.append(find_lane_address(advance_site, arguments))
+    return np.array(addresses)
+
+
+def explain_uncompilable(run: FusedRun) -> str:
+    """Explains why the laws of a run cannot be compiled in lanes, although they can be alone.
+
+    The code is compiled for this answer.
+
+    Args:
+        run: The run before its first tick. There must be no obstacle, see `find_obstacle`.
+
+    Returns:
+        The reason. Empty if there is none.
+    """
+    try:
+        _find_addresses(run, find_structure(run))
+    except NumbaError:
+        return "control laws that cannot be compiled side by side"
+    return ""
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
@@ -161,7 +229,9 @@ class _LinksOfRun:
         self._run = run
         self._ticks = 0
 
-    def set_pending(self, ticks: int, links: NDArray[Any], states: NDArray[np.float64]) -> None:
+    def set_pending(
+        self, ticks: int, links: NDArray[Any], states: Array, received: Array
+    ) -> None:
         """Notes that the run has advanced, and with which results.
 
         Args:
@@ -169,10 +239,11 @@ class _LinksOfRun:
             links: Rows of its links after these ticks. Only fields of the sample in use, and
                 fields that stage 3 of a tick writes, are up to date.
             states: The latest states of its sites, see `repeat_deliveries`.
+            received: Numbers of laws that came with the samples in use, shape (N P, C).
         """
-        self._run.pending_deliveries = partial(self._update, ticks, links, states)
+        self._run.pending_deliveries = partial(self._update, ticks, links, states, received)
 
-    def _update(self, ticks: int, links: NDArray[Any], states: NDArray[np.float64]) -> None:
+    def _update(self, ticks: int, links: NDArray[Any], states: Array, received: Array) -> None:
         """Brings the links of the run up to date, see `set_pending`."""
         memory = self._run.memory
         tables = memory.tables
@@ -185,12 +256,16 @@ class _LinksOfRun:
             dues=tables.dues,
             calendars=tables.calendars,
             points=tables.points,
+            channel=tables.channel,
+            joints=JOINTS,
             states=states,
         )
         self._ticks = ticks
         memory.next_samples[:] = max(ticks - 1, 0)
         for name in (*_REFERENCE_FIELDS, *_STATE_FIELDS):
             tables.links[name] = links.reshape(tables.links.shape)[name]
+        if tables.channel is not None:
+            tables.channel.received[:] = received.reshape(tables.channel.received.shape)
 
 
 class LaneRun:
@@ -223,10 +298,10 @@ class LaneRun:
         self._draws = find_draw_addresses()
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
 
-        # A state waits at most as long as a sample waits in a calendar.
-        self._pages = max(arrays.calendars.shape[2] for arrays in tables)
-        # A state occupies a cache line, because each lane needs the state of another tick.
-        self._states = np.zeros((self._sites, self._pages + 1, LANES, STATE_WIDTH))
+        self._pages = _FIRST_PAGES
+        # A state occupies whole cache lines, because each lane needs that of another tick.
+        width = -(-(3 * JOINTS + layout.sent) // 8) * 8
+        self._states = np.zeros((self._sites, self._pages + 1, LANES, width))
         self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
         self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
@@ -251,21 +326,24 @@ class LaneRun:
         self._progress = pack([memory.progress for memory in memories])
         self._ramps = pack([_view_rows(arrays.ramps) for arrays in tables])
         self._records = allocate_words(self._sites, layout.floats)
+        self._laws = allocate_words(self._sites, layout.law)
+        self._sent = allocate_words(self._sites, layout.sent)
+        self._received = allocate_words(self._sites * structure.peers, layout.received)
+        self._columns = np.zeros((self._sites, structure.peers, layout.received), np.int64)
+        self._code = allocate_words(1, 1)
+        self._put_laws(memories)
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
             site_rows=np.zeros_like(self._site),
             records=np.zeros_like(self._records),
             sums=np.zeros_like(self._sums),
             progress=np.zeros_like(self._progress),
+            laws=np.zeros_like(self._laws),
+            sent=np.zeros_like(self._sent),
             peaks=np.zeros((self._sites, layout.columns, LANES), np.int64),
         )
         self._put_first_states(tables)
-        self._addresses = np.array(
-            [
-                find_lane_address(advance_site, list_argument_types(layout, structure, site))
-                for site in structure.sites
-            ]
-        )
+        self._addresses = _find_addresses(runs[0], structure)
 
     def _put_first_states(self, tables: Sequence[Any]) -> None:
         """Writes the states of all sites before the first tick, which their peers start with.
@@ -282,8 +360,24 @@ class LaneRun:
                     columns = slice(n * JOINTS, (n + 1) * JOINTS)
                     self._states[j, self._pages, lane, columns] = link[name]
 
+    def _put_laws(self, memories: Sequence[RunMemory]) -> None:
+        """Copies the numbers of compiled laws into the lanes.
+
+        Args:
+            memories: Arrays of each run.
+        """
+        for lane in range(LANES):
+            # Lanes without a run repeat the first run.
+            memory = memories[lane if lane < len(memories) else 0]
+            if memory.laws is not None:
+                self._laws[:, :, lane] = memory.laws.rows.view(np.int64)
+                self._sent[:, :, lane] = memory.laws.sent.view(np.int64)
+        channel = memories[0].tables.channel
+        if channel is not None:
+            self._columns[:] = channel.columns
+
     def _find_tables(self) -> IntArray:
-        """Returns the address of each table of each site, shape (N, 10)."""
+        """Returns the address of each table of each site, shape (N, 14)."""
         structure = self._structure
         addresses = []
         for i in range(self._sites):
@@ -300,6 +394,10 @@ class LaneRun:
                 sums=_share(self._sums, i, self._sites),
                 progress=_share(self._progress, i, self._sites),
                 scratch=self._scratch,
+                law=_share(self._laws, i, self._sites),
+                received=_share(self._received, i, self._sites),
+                sent=_share(self._sent, i, self._sites),
+                code=self._code,
             )
             _check_distinct(rows)
             addresses.append([table.ctypes.data for table in rows])
@@ -327,6 +425,8 @@ class LaneRun:
             records=self._records,
             sums=self._sums,
             progress=self._progress,
+            laws=self._laws,
+            sent=self._sent,
             peaks=self._ended.peaks,
         )
         site_fields: Any = self._layout.site.fields
@@ -334,7 +434,7 @@ class LaneRun:
         running = 1
         while self._ticks < ticks and running:
             count = min(BLOCK_TICKS, ticks - self._ticks)
-            use_samples(
+            largest_age = use_samples(
                 self._ticks,
                 count,
                 self._rate_hz,
@@ -343,6 +443,7 @@ class LaneRun:
                 self._draws,
                 self._used,
             )
+            self._keep_states(largest_age)
             running = run_block(
                 first=self._ticks,
                 count=count,
@@ -355,6 +456,7 @@ class LaneRun:
                 tables=tables,
                 states=self._states,
                 used=self._used,
+                columns=self._columns,
                 table=self._table,
                 peaks=self._peaks,
                 present=present,
@@ -363,6 +465,24 @@ class LaneRun:
             self._ticks += count
         for lane in lanes:
             self._write_back(lane, self.runs[lane], until_s)
+
+    def _keep_states(self, ticks: int) -> None:
+        """Makes room for the states of more ticks, if necessary.
+
+        A sample that is older than the sample in use is never used any more. Therefore far
+        fewer states are needed than a link could delay.
+
+        Args:
+            ticks: Number of ticks before the present one whose states are needed.
+        """
+        while self._pages <= ticks:
+            old_pages = self._pages
+            self._pages *= 2
+            states = np.zeros((self._sites, self._pages + 1, *self._states.shape[2:]))
+            kept = np.arange(max(self._ticks - old_pages, 0), self._ticks)
+            states[:, kept % self._pages] = self._states[:, kept % old_pages]
+            states[:, -1] = self._states[:, -1]
+            self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
         """Removes all runs but some from the lanes, so that only these advance further.
@@ -376,6 +496,7 @@ class LaneRun:
         for lane_table in (
             *(self._site, self._links, self._actors, self._environments, self._sums),
             *(self._progress, self._ramps, self._records, self._peaks),
+            *(self._laws, self._sent, self._received),
         ):
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
         self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
@@ -431,6 +552,11 @@ class LaneRun:
         page = (ticks - 1) & (memory.sent.t_ns.shape[1] - 1)
         memory.sent.t_ns[:, page] = tick_ns(ticks - 1, self._rate_hz)
         memory.sent.rows[:, page] = records[:, :, lane].view(np.float64)
+        if memory.laws is not None:
+            laws = self._ended.laws if has_ended else self._laws
+            sent = self._ended.sent if has_ended else self._sent
+            memory.laws.rows[:] = laws[:, :, lane].view(np.float64)
+            memory.laws.sent[:] = sent[:, :, lane].view(np.float64)
         run.ran_s = until_s
         if run.diverged_s is not None:
             run.ran_s = run.diverged_s
@@ -438,7 +564,8 @@ class LaneRun:
             self._links_of_runs[lane].set_pending(
                 ticks=ticks,
                 links=np.ascontiguousarray(self._links[:, :, lane]).view(self._layout.link),
-                states=self._states[:, :, lane, : 3 * JOINTS].copy(),
+                states=self._states[:, :, lane].copy(),
+                received=self._received[:, :, lane].view(np.float64),
             )
 
 

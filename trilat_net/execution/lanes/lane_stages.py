@@ -23,27 +23,28 @@ from ...core.arms.exogenous import (
     torque_on_arm,
 )
 from ...core.plug.plugged import call_address
-from ...core.step.fused_run import update_peaks, update_sums
+from ...core.step.fused_run import first_sent_column, update_peaks, update_sums
 from ...core.step.jit import lane_leaf, leaf, set_lane_form
 from ...core.step.kernel import (
     adapts,
     emit_stages,
     finish_advance,
-    hold_torque,
+    hold_motor_torque,
     reference_stages,
     torque_stage,
 )
+from ...core.step.site_setup import Law
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
 from ...core.step.vectors import Array, IntArray, Pair, Vector, five, pair, put_pair
+from .lane_laws import compute_law
 from .lane_rows import Words, in_lane, pointer_to, select_row
 
 _DIVERGED = int(Mode.DIVERGED)
+_USER = int(Law.USER)
 JOINTS = 2
 """Number of joints of the arms that lanes support."""
 TAU_X_COLUMN = 5 * JOINTS
 """Column of tau_x in a record, after q, qd, q_des, qd_des and tau."""
-STATE_WIDTH = 8
-"""Count of numbers that are reserved for a state, q, qd and tau_x: those of a cache line."""
 STAGES_DTYPE = np.dtype(
     [(name, "f8", (JOINTS,)) for name in ("qdd_1", "qd_2", "qdd_2", "qd_3", "qdd_3")]
 )
@@ -159,8 +160,13 @@ def advance_site(
     sums: Any,
     progress: Any,
     scratch: Any,
+    law: Any,
+    received: Any,
+    sent: Any,
+    code: Any,
     states: Array,
     used: IntArray,
+    columns: IntArray,
     table: TorqueTable,
 ) -> None:
     """Computes one tick of a site for several runs.
@@ -186,9 +192,15 @@ def advance_site(
         sums: Sums of the site.
         progress: Progress of the site.
         scratch: Row with room for the stages of the integrator, see `STAGES_DTYPE`.
-        states: The latest states of all sites, q, qd and tau_x, shape (N, pages + 1, LANES,
-            STATE_WIDTH). The last page holds the state before the first tick.
+        law: Row with the numbers of the site's compiled law.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that the law sends.
+        code: Stands for the code of the law, see `LawCode`.
+        states: The latest states of all sites, q, qd, tau_x and the numbers that the law sent,
+            shape (N, pages + 1, LANES, width). The last page holds the state before the first
+            tick.
         used: Sample in use by peer, lane and tick of a block; -1: none yet.
+        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
     # 2 release: the state of each peer that is in use
@@ -200,11 +212,25 @@ def advance_site(
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
+            if in_lane(site, lane)[0].law == _USER:
+                link.new = sample > link.used
+                link.used_ns = t_ns if sample > link.used else link.used_ns
             link.used = sample
             for c in range(JOINTS):
                 link.q[c] = states[peer, page, lane, c]
                 link.qd[c] = states[peer, page, lane, JOINTS + c]
                 link.tau_x[c] = states[peer, page, lane, 2 * JOINTS + c]
+
+    for p in range(columns.shape[0]):
+        peer = p if p < i else p + 1
+        for c in range(columns.shape[1]):
+            column = columns[p, c]
+            for lane in range(lanes):
+                sample = used[p, lane, block_row]
+                number = 0.0
+                if sample >= 0 and column >= 0:
+                    number = states[peer, sample & (pages - 1), lane, 3 * JOINTS + column]
+                in_lane(received, lane)[p].numbers[c] = number
 
     # 3 reference, 4 errors, 5 estimate
     for lane in range(lanes):
@@ -222,6 +248,17 @@ def advance_site(
     # 6 torque
     for lane in range(lanes):
         torque_stage(in_lane(site, lane), None)
+    for lane in range(lanes):
+        compute_law(
+            code,
+            k,
+            t_ns,
+            in_lane(site, lane),
+            in_lane(links, lane),
+            in_lane(law, lane),
+            in_lane(received, lane),
+            in_lane(sent, lane),
+        )
 
     # 6 limits of the torque, 7 emit
     for lane in range(lanes):
@@ -233,13 +270,20 @@ def advance_site(
             states[i, page, lane, JOINTS + c] = floats[JOINTS + c]
             states[i, page, lane, 2 * JOINTS + c] = floats[TAU_X_COLUMN + c]
 
+    for c in range(in_lane(site, 0)[0].sent):
+        for lane in range(lanes):
+            number = in_lane(sent, lane)[0].numbers[c]
+            floats = in_lane(record, lane)[0].floats
+            floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
+            states[i, k & (pages - 1), lane, 3 * JOINTS + c] = number
+
     # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
     # processor begins with the next lanes while it waits for results of the previous ones.
     t_s = t_ns * 1e-9
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         if s.mode != _DIVERGED:
-            hold_torque(k, s)
+            hold_motor_torque(k, s)
         stages = in_lane(scratch, lane)[0]
         qdd = two_link_stages.find_stage_acceleration(
             t_s=t_s,
@@ -351,6 +395,8 @@ class EndedRuns(NamedTuple):
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words of a row, LANES).
         progress: Rows of the progress, shape (N, words of a row, LANES).
+        laws: Numbers of compiled laws, shape (N, numbers, LANES).
+        sent: Numbers that these laws send, shape (N, numbers, LANES).
         peaks: Peaks in the bucket of the instant, shape (N, 3 n, LANES).
     """
 
@@ -359,6 +405,8 @@ class EndedRuns(NamedTuple):
     records: Words
     sums: Words
     progress: Words
+    laws: Words
+    sent: Words
     peaks: Words
 
 
@@ -415,6 +463,8 @@ def _keep_ended_runs(
         _copy_lane(lane, present.records, ended.records)
         _copy_lane(lane, present.sums, ended.sums)
         _copy_lane(lane, present.progress, ended.progress)
+        _copy_lane(lane, present.laws, ended.laws)
+        _copy_lane(lane, present.sent, ended.sent)
         _copy_lane(lane, peaks[:, bucket], ended.peaks)
     return running
 
@@ -432,6 +482,7 @@ def run_block(
     tables: IntArray,
     states: Array,
     used: IntArray,
+    columns: IntArray,
     table: Array,
     peaks: Words,
     present: EndedRuns,
@@ -449,9 +500,10 @@ def run_block(
         mode_word: Index of the mode among the words of a site's row.
         addresses: Address of the code of `advance_site` for each site, shape (N,).
         tables: For each site the addresses of its tables, in the order of the arguments of
-            `advance_site`, shape (N, 10).
+            `advance_site`, shape (N, 14).
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
+        columns: Indices of the numbers that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: The numbers of all runs.
@@ -489,8 +541,13 @@ def run_block(
                     pointer_to(tables[i, 7]),
                     pointer_to(tables[i, 8]),
                     pointer_to(tables[i, 9]),
+                    pointer_to(tables[i, 10]),
+                    pointer_to(tables[i, 11]),
+                    pointer_to(tables[i, 12]),
+                    pointer_to(tables[i, 13]),
                     states,
                     used[i],
+                    columns[i],
                     table,
                 ),
             )

@@ -15,6 +15,7 @@ import numpy as np
 from ...core.arms.exogenous import LIVE_KINDS, OWN_KINDS
 from ...core.step.site_setup import StaleAction
 from ..fused import FusedRun
+from .lane_laws import LaneLaw, describe_law
 from .lane_rows import Constants
 
 SITE_CONSTANTS = (
@@ -34,11 +35,13 @@ class SiteStructure(NamedTuple):
         constants: Constants of the site.
         actors: Constants of each operator and environment, the operators first.
         first_environment: Index of the first environment; -1: none.
+        law: Compiled law of the site.
     """
 
     constants: Constants
     actors: tuple[Constants, ...]
     first_environment: int
+    law: LaneLaw
 
 
 class RunStructure(NamedTuple):
@@ -86,8 +89,8 @@ def find_obstacle(run: FusedRun) -> str:
         return "Numba is disabled"
     if tables.chain is not None:
         return "arms that are chains of joints"
-    if tables.channel is not None:
-        return "control laws that the kernel does not contain"
+    if run.memory.has_plain_law:
+        return "control laws in plain Python"
     if run.has_programs:
         return "programs that move an arm"
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
@@ -111,12 +114,15 @@ def find_structure(run: FusedRun) -> RunStructure:
     memory = run.memory
     tables = memory.tables
     sites = []
-    for site, actors, sums in zip(tables.site, tables.actors, memory.sums, strict=True):
+    pairs = zip(tables.site, tables.actors, memory.sums, strict=True)
+    for i, (site, actors, sums) in enumerate(pairs):
         rows = _list_actors(actors)
+        columns = None if tables.channel is None else tables.channel.columns[i]
         structure = SiteStructure(
             constants=_read_constants(site[0], SITE_CONSTANTS),
             actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
             first_environment=int(sums["first_environment"]),
+            law=describe_law(memory.compiled_laws.get(i), columns),
         )
         sites.append(structure)
     return RunStructure(

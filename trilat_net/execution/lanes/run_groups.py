@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 from ..fused import FusedRun
 from .lane_rows import LANES
-from .lane_run import LaneRun
+from .lane_run import LaneRun, explain_uncompilable
 from .lane_structure import RunStructure, find_obstacle, find_structure
 
 LEAST_RUNS = 4
@@ -41,8 +41,14 @@ class RunGroup:
             until_s: The time, s, later than that of the previous call.
         """
         if self._lanes is not None:
-            self._lanes.advance_to(until_s)
-            return
+            try:
+                self._lanes.advance_to(until_s)
+            except Exception:
+                # The law of some run failed, which ends the tick of all runs. Each run still
+                # has the state of the previous call. Now only the run whose law fails ends.
+                self._lanes = None
+            else:
+                return
         for run in self._runs:
             run.advance_to(until_s)
 
@@ -78,7 +84,7 @@ def group_runs(runs: Sequence[FusedRun]) -> Iterator[RunGroup]:
         for first in range(0, len(indices), LANES):
             members = indices[first : first + LANES]
             chosen = [runs[index] for index in members]
-            if len(members) >= LEAST_RUNS:
+            if len(members) >= LEAST_RUNS and not explain_uncompilable(chosen[0]):
                 yield RunGroup(members, chosen, in_lanes=True)
                 continue
             for index, run in zip(members, chosen, strict=True):
