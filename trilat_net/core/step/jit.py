@@ -752,6 +752,21 @@ def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, .
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
 
+def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
+    """Returns True if a function of lanes need not be compiled any more.
+
+    Args:
+        function: A function with the decorator `lane_leaf`.
+        argument_types: Numba's types of its arguments.
+    """
+    dispatcher: Any = function
+    if argument_types in dispatcher.overloads:
+        return True
+    stored = dispatcher._cache
+    key = stored._index_key(argument_types, dispatcher.targetctx.codegen())
+    return key in stored._cache_file._load_index()
+
+
 def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
     """Returns the machine code of a function of lanes as text, for tests.
 

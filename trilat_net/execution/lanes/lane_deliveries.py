@@ -35,6 +35,7 @@ from ...core.links.delay import (
 from ...core.links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
 from ...core.links.philox import DrawKey, uniforms
 from ...core.plug.plugged import call_address
+from ...core.step.fused_run import ReplayedInputs
 from ...core.step.jit import find_lane_address, lane_leaf, leaf
 from ...core.step.kernel import channel_of
 from ...core.step.row_fields import LinkRow
@@ -446,6 +447,72 @@ def use_samples(
                 for index in range(count):
                     age = first + index - used[i, p, lane, index]
                     largest_age = max(largest_age, age)
+    return largest_age
+
+
+@leaf
+def use_recorded_samples(
+    first: int,
+    count: int,
+    rate_hz: int,
+    feed: ReplayedInputs,
+    links: RowArray,
+    models: RowArray,
+    dues: IntArray,
+    calendars: RowArray,
+    points: Points,
+    channel: ChannelArrays | None,
+    state: Array,
+    used: IntArray,
+) -> int:
+    """Finds the samples in use in a recorded run, whose arrivals are known, see `use_samples`.
+
+    Args:
+        first: First tick of the block.
+        count: Number of ticks.
+        rate_hz: Tick rate of all sites, Hz.
+        feed: Inputs of the recorded run.
+        links: Rows of the links, shape (N, P); changed.
+        models: Models of the links, shape (N, P, M).
+        dues: Due times, shape (N, P, D); changed.
+        calendars: Calendars of the links, shape (N, P, pages); changed. Their samples have the
+            right index, but no content.
+        points: Traces and outages.
+        channel: Numbers that laws receive, or None; changed.
+        state: Any numbers, at least as many as a site sends.
+        used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks).
+
+    Returns:
+        The largest age of a sample in use, ticks, see `use_samples`.
+    """
+    largest_age = 0
+    for index in range(count):
+        k = first + index
+        for i in range(links.shape[0]):
+            for p in range(links.shape[1]):
+                link = LinkArrays(
+                    state=links[i, p : p + 1],
+                    models=models[i, p],
+                    dues=dues[i, p],
+                    calendar=calendars[i, p],
+                    points=points,
+                    channel=channel_of(channel_of(channel, i), p),
+                )
+                for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
+                    accept_sample(
+                        k=k,
+                        rate_hz=rate_hz,
+                        tick=feed.samples[n],
+                        q=state,
+                        qd=state,
+                        tau_x=state,
+                        sent=state,
+                        link=link,
+                    )
+                release_sample(k, rate_hz, link)
+                sample = links[i, p].used
+                used[i, p, 0, index] = sample
+                largest_age = max(largest_age, k - sample)
     return largest_age
 
 

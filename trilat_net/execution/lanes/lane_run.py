@@ -156,7 +156,7 @@ def list_argument_types(
         code=LawCode(site.law),
     )
     integer = types.int64
-    numbers = (integer, integer, integer, types.float64, integer, integer, integer, integer)
+    numbers = (*(integer,) * 3, types.float64, *(integer,) * 5)
     states = types.Array(types.float64, 4, "C")
     used = types.Array(types.int64, 3, "C")
     columns = types.Array(types.int64, 2, "C")
@@ -274,12 +274,13 @@ class LaneRun:
     Args:
         runs: The runs before their first tick, at most `LANES`. They must have the same
             structure, see `find_structure`, and no obstacle, see `find_obstacle`.
+        record_rows: Number of latest records of each site that are kept, a power of two.
 
     Attributes:
         runs: The runs that are in the lanes. `advance_to` writes the results into them.
     """
 
-    def __init__(self, runs: Sequence[FusedRun]) -> None:
+    def __init__(self, runs: Sequence[FusedRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
         structure = find_structure(runs[0])
         assert all(find_structure(run) == structure for run in runs)
@@ -325,7 +326,8 @@ class LaneRun:
         self._sums = pack([memory.sums for memory in memories])
         self._progress = pack([memory.progress for memory in memories])
         self._ramps = pack([_view_rows(arrays.ramps) for arrays in tables])
-        self._records = allocate_words(self._sites, layout.floats)
+        records = allocate_words(self._sites * record_rows, layout.floats)
+        self._records = records.reshape(self._sites, record_rows, layout.floats, LANES)
         self._laws = allocate_words(self._sites, layout.law)
         self._sent = allocate_words(self._sites, layout.sent)
         self._received = allocate_words(self._sites * structure.peers, layout.received)
@@ -335,7 +337,7 @@ class LaneRun:
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
             site_rows=np.zeros_like(self._site),
-            records=np.zeros_like(self._records),
+            records=np.zeros_like(self._records[:, 0]),
             sums=np.zeros_like(self._sums),
             progress=np.zeros_like(self._progress),
             laws=np.zeros_like(self._laws),
@@ -389,7 +391,7 @@ class LaneRun:
                     max(structure.sites[i].first_environment, 0) :
                 ],
                 ramps=_share(self._ramps, i, self._sites),
-                record=_share(self._records, i, self._sites),
+                record=self._records[i],
                 peaks=self._peaks[i],
                 sums=_share(self._sums, i, self._sites),
                 progress=_share(self._progress, i, self._sites),
@@ -418,7 +420,36 @@ class LaneRun:
         for lane in lanes:
             self.runs[lane].plan([ticks] * self._sites)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
-        tables = self._find_tables()
+        self._step_to(ticks)
+        for lane in lanes:
+            self._write_back(lane, self.runs[lane], until_s)
+
+    def _use_samples(self, first: int, count: int) -> int:
+        """Finds the samples that are used in a block of ticks, see `use_samples`.
+
+        Args:
+            first: First tick of the block.
+            count: Number of ticks.
+
+        Returns:
+            The largest age of a sample in use, ticks.
+        """
+        return use_samples(
+            first,
+            count,
+            self._rate_hz,
+            self._ended.ticks,
+            self._deliveries,
+            self._draws,
+            self._used,
+        )
+
+    def _step_to(self, ticks: int) -> None:
+        """Steps all runs until they have made a number of ticks, or have ended.
+
+        Args:
+            ticks: Number of ticks since the start of the runs.
+        """
         present = EndedRuns(
             ticks=self._ended.ticks,
             site_rows=self._site,
@@ -431,19 +462,11 @@ class LaneRun:
         )
         site_fields: Any = self._layout.site.fields
         _, mode_offset = site_fields["mode"]
+        tables = self._find_tables()
         running = 1
         while self._ticks < ticks and running:
             count = min(BLOCK_TICKS, ticks - self._ticks)
-            largest_age = use_samples(
-                self._ticks,
-                count,
-                self._rate_hz,
-                self._ended.ticks,
-                self._deliveries,
-                self._draws,
-                self._used,
-            )
-            self._keep_states(largest_age)
+            self._keep_states(self._use_samples(self._ticks, count))
             running = run_block(
                 first=self._ticks,
                 count=count,
@@ -452,6 +475,7 @@ class LaneRun:
                 settled_rad=self._structure.settled_rad,
                 pages=self._pages,
                 mode_word=mode_offset // 8,
+                record_rows=self._records.shape[1],
                 addresses=self._addresses,
                 tables=tables,
                 states=self._states,
@@ -463,8 +487,6 @@ class LaneRun:
                 ended=self._ended,
             )
             self._ticks += count
-        for lane in lanes:
-            self._write_back(lane, self.runs[lane], until_s)
 
     def _keep_states(self, ticks: int) -> None:
         """Makes room for the states of more ticks, if necessary.
@@ -527,7 +549,8 @@ class LaneRun:
         has_ended = ended_ticks >= 0
         ticks = ended_ticks if has_ended else self._ticks
         site_rows = self._ended.site_rows if has_ended else self._site
-        records = self._ended.records if has_ended else self._records
+        record_row = (ticks - 1) & (self._records.shape[1] - 1)
+        records = self._ended.records if has_ended else self._records[:, record_row]
         sums = self._ended.sums if has_ended else self._sums
         progress = self._ended.progress if has_ended else self._progress
 

@@ -150,6 +150,7 @@ def advance_site(
     block_row: int,
     pages: int,
     bucket: int,
+    record_row: int,
     site: Any,
     links: Any,
     actors: Any,
@@ -182,12 +183,13 @@ def advance_site(
         block_row: Row of the tick in `used`.
         pages: Number of latest states of each site in `states`, a power of two.
         bucket: Row of the tick in `peaks`.
+        record_row: Row of the tick in `record`.
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
         environments: The rows of its environments among them.
         ramps: Row with the changes of its dominance factors.
-        record: Row with the floats of its record; written.
+        record: Rows with the floats of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
@@ -262,7 +264,7 @@ def advance_site(
 
     # 6 limits of the torque, 7 emit
     for lane in range(lanes):
-        floats = in_lane(record, lane)[0].floats
+        floats = in_lane(record, lane)[record_row].floats
         emit_stages(k=k, t_ns=t_ns, s=in_lane(site, lane)[0], chain=None, record=floats)
         page = k & (pages - 1)
         for c in range(JOINTS):
@@ -273,7 +275,7 @@ def advance_site(
     for c in range(in_lane(site, 0)[0].sent):
         for lane in range(lanes):
             number = in_lane(sent, lane)[0].numbers[c]
-            floats = in_lane(record, lane)[0].floats
+            floats = in_lane(record, lane)[record_row].floats
             floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
             states[i, k & (pages - 1), lane, 3 * JOINTS + c] = number
 
@@ -359,7 +361,7 @@ def advance_site(
     # Statistics of the run.
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
-        floats = in_lane(record, lane)[0].floats
+        floats = in_lane(record, lane)[record_row].floats
         site_sums = in_lane(sums, lane)[0]
         update_peaks(
             row=floats,
@@ -430,6 +432,7 @@ def _keep_ended_runs(
     runs: int,
     mode_word: int,
     bucket: int,
+    record_row: int,
     peaks: Words,
     present: EndedRuns,
     ended: EndedRuns,
@@ -441,8 +444,10 @@ def _keep_ended_runs(
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
         bucket: The present bucket.
+        record_row: Row of the latest record.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
-        present: Numbers of all runs now. Its peaks are not used.
+        present: Numbers of all runs now, with several rows of records per site. Its peaks are
+            not used.
         ended: Written.
 
     Returns:
@@ -460,7 +465,7 @@ def _keep_ended_runs(
             continue
         ended.ticks[lane] = ticks
         _copy_lane(lane, present.site_rows, ended.site_rows)
-        _copy_lane(lane, present.records, ended.records)
+        _copy_lane(lane, present.records[:, record_row], ended.records)
         _copy_lane(lane, present.sums, ended.sums)
         _copy_lane(lane, present.progress, ended.progress)
         _copy_lane(lane, present.laws, ended.laws)
@@ -478,6 +483,7 @@ def run_block(
     settled_rad: float,
     pages: int,
     mode_word: int,
+    record_rows: int,
     addresses: IntArray,
     tables: IntArray,
     states: Array,
@@ -498,6 +504,7 @@ def run_block(
         settled_rad: Position error below which an arm counts as settled, rad.
         pages: Number of latest states of each site, a power of two.
         mode_word: Index of the mode among the words of a site's row.
+        record_rows: Number of latest records of each site that are kept, a power of two.
         addresses: Address of the code of `advance_site` for each site, shape (N,).
         tables: For each site the addresses of its tables, in the order of the arguments of
             `advance_site`, shape (N, 14).
@@ -513,12 +520,14 @@ def run_block(
         The number of runs that have not ended.
     """
     running = runs
-    # Whole vector registers: the numbers of lanes without a run have no meaning.
-    lanes = (runs + 7) // 8 * 8
+    # Whole vector registers: the numbers of lanes without a run have no meaning. One or two
+    # lanes more are faster without vectors.
+    lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
     for block_row in range(count):
         k = first + block_row
         t_ns = tick_ns(k, rate_hz)
         bucket = k * BUCKETS_PER_S // rate_hz
+        record_row = k & (record_rows - 1)
         for i in range(addresses.shape[0]):
             call_address(
                 addresses[i],
@@ -531,6 +540,7 @@ def run_block(
                     block_row,
                     pages,
                     bucket,
+                    record_row,
                     pointer_to(tables[i, 0]),
                     pointer_to(tables[i, 1]),
                     pointer_to(tables[i, 2]),
@@ -556,6 +566,7 @@ def run_block(
             runs=runs,
             mode_word=mode_word,
             bucket=bucket,
+            record_row=record_row,
             peaks=peaks,
             present=present,
             ended=ended,
