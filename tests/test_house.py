@@ -38,6 +38,8 @@ TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
 
 CALLED_BY_LIBRARIES = {
     "FencedExamples.on_object",
+    "LaneVector.can_convert_from",
+    "LaneVector.unify",
     "_CompilingNotice.on_end",
     "_CompilingNotice.on_start",
     "_CompressedFiles._load_data",

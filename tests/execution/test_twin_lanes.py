@@ -86,6 +86,12 @@ def test_twins_of_a_compiled_law_are_equal_in_lanes(monkeypatch: pytest.MonkeyPa
     check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))
 
 
+def test_twins_of_a_chain_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = load_scenario("six_joints")
+    pushes = push_in_many_ways(scenario, scenario.names[0])
+    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 2.0))
+
+
 def test_twins_that_leave_their_limits_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """An arm passes its speed limit after some windows; the lanes then start again one by one."""
     scenario = load_scenario("two_sites", {"limits.qd_limit_rad_s": 1.0})

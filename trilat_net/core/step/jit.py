@@ -556,12 +556,16 @@ class _LaneCompiler(_LeafCompiler):
 
 
 def is_in_lanes(numba_type: Any) -> bool:
-    """Returns True if a value is a row of several runs side by side.
+    """Returns True if a value is a row of several runs side by side, or contains such values.
 
     Args:
         numba_type: Numba's type of the value. A type of rows in lanes has the attribute
             `in_lanes`.
     """
+    if isinstance(numba_type, types.Array):
+        return is_in_lanes(numba_type.dtype)
+    if isinstance(numba_type, types.BaseTuple):
+        return any(map(is_in_lanes, numba_type.types))
     return bool(getattr(numba_type, "in_lanes", False))
 
 

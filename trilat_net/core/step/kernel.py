@@ -126,13 +126,22 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
         chain: Rows of the chain, or None.
     """
     # `adapts` is evaluated last, because it is the costly condition.
-    if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not adapts(s):
-        return
+    if has_estimate(k, s) and adapts(s):
+        sum_trapezoid(s)
+        _advance_estimate(s, chain, 0.5 / s.rate_hz, s.Yr_before)
+
+
+@leaf
+def has_estimate(k: int, s: SiteRow) -> bool:
+    """Returns True if stage 5 updates the estimate of the law in a tick, if it adapts."""
+    return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
+
+
+@leaf
+def sum_trapezoid(s: SiteRow) -> None:
+    """Writes the sum Y' r of both ticks into `Yr_before`, see `_update_estimate`."""
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
-    sum_of_both_ticks = s.Yr_before
-    half_h_s = 0.5 / s.rate_hz
-    _advance_estimate(s, chain, half_h_s, sum_of_both_ticks)
 
 
 @leaf
@@ -470,6 +479,24 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 
 @leaf
+def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
+    """Ends stage 3: stops the reference while peers are silent, and limits its speed.
+
+    Args:
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        s: State of the site, with the reference; changed.
+        links: States of the links from the other sites.
+    """
+    if s.on_stale == _GLIDE:
+        update_session_life(t_ns, s, links)
+    else:
+        update_stale_mode(t_ns, s, links)
+    if not rests(s):
+        limit_reference(k, s)
+
+
+@leaf
 def reference_stages(
     k: int,
     t_ns: int,
@@ -500,12 +527,7 @@ def reference_stages(
     # 3 reference
     update_reference(t_ns, s, links, ramps)
     _place_arm(s, chain, links, True)
-    if s.on_stale == _GLIDE:
-        update_session_life(t_ns, s, links)
-    else:
-        update_stale_mode(t_ns, s, links)
-    if not rests(s):
-        limit_reference(k, s)
+    guard_reference(k, t_ns, s, links)
     # 4 errors
     _update_errors(s, chain)
     # 5 estimate

@@ -89,7 +89,7 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
     return name, bool(sources)
 
 
-def describe_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
+def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
     """Returns what decides about the compiled code of a site's law.
 
     Args:

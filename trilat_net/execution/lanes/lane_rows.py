@@ -280,7 +280,8 @@ class _RowsItem(AbstractTemplate):
             return None
         if len(set(rows.constants)) > 1:
             return None
-        return signature(LaneRow(rows, rows.constants[:1]), rows, types.intp)
+        constants = rows.constants[:1] or ((),)
+        return signature(LaneRow(rows, constants), rows, types.intp)
 
 
 @lower_builtin(operator.getitem, RowsInLane, types.Integer)

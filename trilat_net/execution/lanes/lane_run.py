@@ -2,11 +2,12 @@
 
 Invariant:
     - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
-      for bit. Only the entries of ring buffers that are not used any more may differ.
+      for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries of
+      ring buffers that are not used any more, may differ.
     - The tables of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from ...core.step.jit import find_lane_address, read_lane_assembly
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
 from ...core.step.vectors import Array, IntArray
 from ..fused import FusedRun, RunMemory
+from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (
     BLOCK_TICKS,
     copy_link_states,
@@ -31,7 +33,7 @@ from .lane_deliveries import (
 )
 from .lane_laws import LawCode
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
-from .lane_stages import JOINTS, STAGES_DTYPE, EndedRuns, advance_site, run_block
+from .lane_stages import STAGES_DTYPE, EndedRuns, advance_site, run_block
 from .lane_structure import RunStructure, SiteStructure, find_structure
 
 _FIRST_PAGES = 256
@@ -60,6 +62,7 @@ class SiteTables(NamedTuple):
         received: Rows with the numbers that the peers' laws sent.
         sent: Row with the numbers that its law sends.
         code: Stands for the code of the law. The table itself is not used.
+        chain: Rows of the joints, if the arm is a chain.
     """
 
     site: Any
@@ -76,6 +79,7 @@ class SiteTables(NamedTuple):
     received: Any
     sent: Any
     code: Any
+    chain: Any
 
 
 class LaneLayout(NamedTuple):
@@ -90,6 +94,8 @@ class LaneLayout(NamedTuple):
         floats: Number of floats in a record.
         columns: Number of columns of the peaks.
         ramps: Shape of the table of dominance factors.
+        chain: Of the row of a joint. None for planar arms.
+        joints: Number of joints that sites share.
         law: Largest count of numbers of a compiled law.
         received: Largest count of numbers that a law receives from a peer.
         sent: Largest count of numbers that a law sends.
@@ -103,6 +109,8 @@ class LaneLayout(NamedTuple):
     floats: int
     columns: int
     ramps: tuple[int, ...]
+    chain: np.dtype[Any] | None
+    joints: int
     law: int
     received: int
     sent: int
@@ -121,6 +129,8 @@ def find_layout(run: FusedRun) -> LaneLayout:
         floats=memory.sent.rows.shape[2],
         columns=memory.peaks.shape[2],
         ramps=tables.ramps.shape[1:],
+        chain=None if tables.chain is None else tables.chain.dtype,
+        joints=tables.links["q"].shape[2],
         law=0 if memory.laws is None else memory.laws.rows.shape[1],
         received=0 if tables.channel is None else tables.channel.received.shape[2],
         sent=0 if memory.laws is None else memory.laws.sent.shape[1],
@@ -138,11 +148,17 @@ def list_argument_types(
         site: Structure of the site.
     """
     first = site.first_environment
-    environments = site.actors[first:] if first >= 0 else ()
+    actors = site.actors
+    chain = _type_numbers(0, 1)
+    if layout.chain is not None:
+        # The actors of a chain are selected by the variable of a loop.
+        actors = ((),) * len(actors)
+        chain = LaneTable(layout.chain, ((("prismatic", 0),),) * layout.joints)
+    environments = actors[first:] if first >= 0 else ()
     tables = SiteTables(
         site=LaneTable(layout.site, (site.constants,)),
         links=LaneTable(layout.link, ((),) * structure.peers),
-        actors=LaneTable(layout.actor, site.actors),
+        actors=LaneTable(layout.actor, actors),
         environments=LaneTable(layout.actor, environments),
         ramps=LaneTable(np.dtype([("rows", "f8", layout.ramps)])),
         record=LaneTable(np.dtype([("floats", "f8", (layout.floats,))])),
@@ -154,6 +170,7 @@ def list_argument_types(
         received=_type_numbers(layout.received, structure.peers),
         sent=_type_numbers(layout.sent, 1),
         code=LawCode(site.law),
+        chain=chain,
     )
     integer = types.int64
     numbers = (*(integer,) * 3, types.float64, *(integer,) * 5)
@@ -174,6 +191,11 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
     return LaneTable(np.dtype([("numbers", "f8", (count,))]), ((),) * rows)
 
 
+def choose_code(layout: LaneLayout) -> Callable[..., None]:
+    """Returns the function that computes a tick of a site in lanes."""
+    return advance_site if layout.chain is None else advance_chain_site
+
+
 def _find_addresses(run: FusedRun, structure: RunStructure) -> IntArray:
     """Compiles the code of each site of a run, or loads it, and returns its addresses.
 
@@ -184,7 +206,7 @@ def _find_addresses(run: FusedRun, structure: RunStructure) -> IntArray:
     addresses = []
     for site in structure.sites:
         arguments = list_argument_types(layout, structure, site)
-        addresses.append(find_lane_address(advance_site, arguments))
+        addresses.append(find_lane_address(choose_code(layout), arguments))
     return np.array(addresses)
 
 
@@ -214,8 +236,9 @@ def read_assembly(run: FusedRun, i: int) -> str:
         i: Index of the site.
     """
     structure = find_structure(run)
-    arguments = list_argument_types(find_layout(run), structure, structure.sites[i])
-    return read_lane_assembly(advance_site, arguments)
+    layout = find_layout(run)
+    arguments = list_argument_types(layout, structure, structure.sites[i])
+    return read_lane_assembly(choose_code(layout), arguments)
 
 
 class _LinksOfRun:
@@ -257,7 +280,7 @@ class _LinksOfRun:
             calendars=tables.calendars,
             points=tables.points,
             channel=tables.channel,
-            joints=JOINTS,
+            joints=tables.links["q"].shape[2],
             states=states,
         )
         self._ticks = ticks
@@ -301,7 +324,7 @@ class LaneRun:
 
         self._pages = _FIRST_PAGES
         # A state occupies whole cache lines, because each lane needs that of another tick.
-        width = -(-(3 * JOINTS + layout.sent) // 8) * 8
+        width = -(-(3 * layout.joints + layout.sent) // 8) * 8
         self._states = np.zeros((self._sites, self._pages + 1, LANES, width))
         self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
         self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
@@ -333,6 +356,9 @@ class LaneRun:
         self._received = allocate_words(self._sites * structure.peers, layout.received)
         self._columns = np.zeros((self._sites, structure.peers, layout.received), np.int64)
         self._code = allocate_words(1, 1)
+        self._chain = allocate_words(self._sites, 0)
+        if first.chain is not None:
+            self._chain = pack([arrays.chain for arrays in tables])
         self._put_laws(memories)
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
@@ -359,7 +385,8 @@ class LaneRun:
                 receiver = 1 if j == 0 else 0
                 link = arrays.links[receiver, j if j < receiver else j - 1]
                 for n, name in enumerate(_STATE_FIELDS):
-                    columns = slice(n * JOINTS, (n + 1) * JOINTS)
+                    joints = self._layout.joints
+                    columns = slice(n * joints, (n + 1) * joints)
                     self._states[j, self._pages, lane, columns] = link[name]
 
     def _put_laws(self, memories: Sequence[RunMemory]) -> None:
@@ -379,7 +406,7 @@ class LaneRun:
             self._columns[:] = channel.columns
 
     def _find_tables(self) -> IntArray:
-        """Returns the address of each table of each site, shape (N, 14)."""
+        """Returns the address of each table of each site, shape (N, 15)."""
         structure = self._structure
         addresses = []
         for i in range(self._sites):
@@ -400,6 +427,7 @@ class LaneRun:
                 received=_share(self._received, i, self._sites),
                 sent=_share(self._sent, i, self._sites),
                 code=self._code,
+                chain=_share(self._chain, i, self._sites),
             )
             _check_distinct(rows)
             addresses.append([table.ctypes.data for table in rows])
@@ -518,7 +546,7 @@ class LaneRun:
         for lane_table in (
             *(self._site, self._links, self._actors, self._environments, self._sums),
             *(self._progress, self._ramps, self._records, self._peaks),
-            *(self._laws, self._sent, self._received),
+            *(self._laws, self._sent, self._received, self._chain),
         ):
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
         self._states[:, :, : len(lanes)] = self._states[:, :, lanes]

@@ -165,6 +165,7 @@ def advance_site(
     received: Any,
     sent: Any,
     code: Any,
+    _chain: Any,
     states: Array,
     used: IntArray,
     columns: IntArray,
@@ -505,9 +506,10 @@ def run_block(
         pages: Number of latest states of each site, a power of two.
         mode_word: Index of the mode among the words of a site's row.
         record_rows: Number of latest records of each site that are kept, a power of two.
-        addresses: Address of the code of `advance_site` for each site, shape (N,).
+        addresses: Address of the code of `advance_site` or `advance_chain_site` for each site,
+            shape (N,).
         tables: For each site the addresses of its tables, in the order of the arguments of
-            `advance_site`, shape (N, 14).
+            `advance_site`, shape (N, 15).
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
         columns: Indices of the numbers that laws receive, shape (N, P, C).
@@ -555,6 +557,7 @@ def run_block(
                     pointer_to(tables[i, 11]),
                     pointer_to(tables[i, 12]),
                     pointer_to(tables[i, 13]),
+                    pointer_to(tables[i, 14]),
                     states,
                     used[i],
                     columns[i],

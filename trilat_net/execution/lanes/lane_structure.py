@@ -13,9 +13,10 @@ import numba
 import numpy as np
 
 from ...core.arms.exogenous import LIVE_KINDS, OWN_KINDS
+from ...core.step.site_arrays import SiteArrays
 from ...core.step.site_setup import StaleAction
 from ..fused import FusedRun
-from .lane_laws import LaneLaw, describe_law
+from .lane_laws import LaneLaw, describe_lane_law
 from .lane_rows import Constants
 
 SITE_CONSTANTS = (
@@ -88,7 +89,9 @@ def find_obstacle(run: FusedRun) -> str:
     if config.DISABLE_JIT:
         return "Numba is disabled"
     if tables.chain is not None:
-        return "arms that are chains of joints"
+        obstacle = _find_obstacle_of_chains(tables)
+        if obstacle:
+            return obstacle
     if run.memory.has_plain_law:
         return "control laws in plain Python"
     if run.has_programs:
@@ -102,6 +105,24 @@ def find_obstacle(run: FusedRun) -> str:
         return "on_stale.action 'glide'"
     if len(set(tables.site["rate_hz"].ravel().tolist())) > 1:
         return "tick rates that differ between sites"
+    return ""
+
+
+def _find_obstacle_of_chains(tables: SiteArrays) -> str:
+    """Explains why runs with chains of joints cannot be computed together.
+
+    Args:
+        tables: Arrays of all sites of a run.
+    """
+    if tables.channel is not None:
+        return "compiled laws of arms that are chains of joints"
+    counts = set(tables.site["joints"].ravel().tolist())
+    if tables.site["task"].any():
+        return "chains of joints whose sites share poses"
+    if counts != {tables.links["q"].shape[2]}:
+        return "chains with different numbers of joints"
+    if tables.chain is not None and tables.chain["prismatic"].any():
+        return "chains with prismatic joints"
     return ""
 
 
@@ -122,7 +143,7 @@ def find_structure(run: FusedRun) -> RunStructure:
             constants=_read_constants(site[0], SITE_CONSTANTS),
             actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
             first_environment=int(sums["first_environment"]),
-            law=describe_law(memory.compiled_laws.get(i), columns),
+            law=describe_lane_law(memory.compiled_laws.get(i), columns),
         )
         sites.append(structure)
     return RunStructure(

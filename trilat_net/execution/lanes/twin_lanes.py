@@ -20,8 +20,7 @@ from ...core.step.vectors import Array, IntArray
 from ..fused import FusedRun, mark_floats, scale_differences
 from .lane_deliveries import use_recorded_samples
 from .lane_rows import LANES, Words
-from .lane_run import LaneRun, find_layout, list_argument_types
-from .lane_stages import advance_site
+from .lane_run import LaneRun, choose_code, find_layout, list_argument_types
 from .lane_structure import find_obstacle, find_structure
 from .run_groups import LEAST_RUNS
 
@@ -30,7 +29,7 @@ class LaneEndedError(Exception):
     """A run in lanes cannot continue, because an arm left its limits or a law failed."""
 
 
-def is_compiled(run: FusedRun) -> bool:
+def has_lane_code(run: FusedRun) -> bool:
     """Returns True if the code for a run in lanes exists already.
 
     Args:
@@ -39,7 +38,7 @@ def is_compiled(run: FusedRun) -> bool:
     structure = find_structure(run)
     layout = find_layout(run)
     return all(
-        is_lane_code_stored(advance_site, list_argument_types(layout, structure, site))
+        is_lane_code_stored(choose_code(layout), list_argument_types(layout, structure, site))
         for site in structure.sites
     )
 
@@ -56,7 +55,7 @@ def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> 
     if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
         return False
     site_ticks = runs * ticks * len(run.scenario.names)
-    return site_ticks >= least_site_ticks or is_compiled(run)
+    return site_ticks >= least_site_ticks or has_lane_code(run)
 
 
 class TwinLanes(LaneRun):
