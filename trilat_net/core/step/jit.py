@@ -565,7 +565,8 @@ def is_in_lanes(numba_type: Any) -> bool:
     if isinstance(numba_type, types.Array):
         return is_in_lanes(numba_type.dtype)
     if isinstance(numba_type, types.BaseTuple):
-        return any(map(is_in_lanes, numba_type.types))
+        entry_types: Any = numba_type
+        return any(map(is_in_lanes, entry_types.types))
     return bool(getattr(numba_type, "in_lanes", False))
 
 

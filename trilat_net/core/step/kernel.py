@@ -126,13 +126,13 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
         chain: Rows of the chain, or None.
     """
     # `adapts` is evaluated last, because it is the costly condition.
-    if has_estimate(k, s) and adapts(s):
+    if updates_estimate(k, s) and adapts(s):
         sum_trapezoid(s)
         _advance_estimate(s, chain, 0.5 / s.rate_hz, s.Yr_before)
 
 
 @leaf
-def has_estimate(k: int, s: SiteRow) -> bool:
+def updates_estimate(k: int, s: SiteRow) -> bool:
     """Returns True if stage 5 updates the estimate of the law in a tick, if it adapts."""
     return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
 

@@ -24,9 +24,9 @@ from ...core.step.kernel import (
     emit_stages,
     finish_advance,
     guard_reference,
-    has_estimate,
     hold_motor_torque,
     sum_trapezoid,
+    updates_estimate,
 )
 from ...core.step.ticks import Mode
 from ...core.step.vectors import Array, IntArray
@@ -186,7 +186,7 @@ def advance_chain_site(
     for group in range(groups):
         group_site = in_group(site, group)[0]
         chain_stages.update_errors(group_site, in_group(chain, group))
-        if has_estimate(k, group_site):
+        if updates_estimate(k, group_site):
             sum_trapezoid(group_site)
             half_s = 0.5 / group_site.rate_hz
             chain_stages.advance_estimate(group_site, half_s, group_site.Yr_before)

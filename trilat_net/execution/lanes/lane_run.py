@@ -358,7 +358,7 @@ class LaneRun:
         self._code = allocate_words(1, 1)
         self._chain = allocate_words(self._sites, 0)
         if first.chain is not None:
-            self._chain = pack([arrays.chain for arrays in tables])
+            self._chain = pack([np.asarray(arrays.chain) for arrays in tables])
         self._put_laws(memories)
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
