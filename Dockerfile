@@ -22,14 +22,13 @@ COPY pyproject.toml README.md LICENSE /src/
 COPY trilat_net /src/trilat_net
 COPY sites /src/sites
 COPY recorder /src/recorder
-COPY live /src/live
 COPY packages /src/packages
 # Whole seconds, because an image keeps no others, and a cache of compiled code goes by the time of its source.
 RUN python -m pip --python /opt/trilat/bin/python install --quiet --no-cache-dir --disable-pip-version-check \
         --no-deps --no-build-isolation --no-compile /src /src/packages/trilat-* \
     && python -m pip --python /opt/trilat/bin/python uninstall --quiet --yes setuptools \
-    && find trilat_net sites recorder live trilat_ros2 trilat_studies -exec touch -d "@$(date +%s)" {} + \
-    && /opt/trilat/bin/python -m compileall -q trilat_net sites recorder live trilat_ros2 trilat_studies
+    && find trilat_net sites recorder trilat_people trilat_ros2 trilat_studies -exec touch -d "@$(date +%s)" {} + \
+    && /opt/trilat/bin/python -m compileall -q trilat_net sites recorder trilat_people trilat_ros2 trilat_studies
 COPY containers/entry.py /opt/trilat/entry.py
 # A run and its report show that the image works, and leave what they compiled.
 ENV XDG_CACHE_HOME=/opt/trilat/cache

@@ -9,7 +9,7 @@ LOCKED := --quiet --require-hashes --only-binary :all: -r
 # uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
 INSTALL = @$(BIN)/uv pip install --python $(BIN)/python $(LOCKED) $< || $(PIP) $(LOCKED) $<
 
-.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms test-long faults docs media bench suite-gains suite lock clean
+.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms packages test-long faults docs media bench suite-gains suite lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -19,6 +19,7 @@ help:
 	@echo "make extras EXTRAS=view    optional packages as well; without EXTRAS it lists them"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every test, every live session, endurance"
+	@echo "make packages     the tests of each package, where only the core and the package are installed"
 	@echo "make push-set     measure anew which tests make test leaves to make test-long"
 	@echo "make faults       docs/data/fault-matrix.csv: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
@@ -74,10 +75,10 @@ test:
 
 pytest: $(VENV)/dev.stamp
 	@TRILAT_TEST_RUN=tests nice -n 19 $(BIN)/python -m pytest -q -p tests.progress -n $$(getconf _NPROCESSORS_ONLN) --dist worksteal \
-		-m "not live and not long" --ignore tests/live
+		-m "not live and not long" --ignore tests/live --ignore packages/trilat-people/tests/live_tests
 
 SESSIONS = TRILAT_TEST_RUN=sessions flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -p tests.progress \
-	-o cache_dir=.pytest_cache/sessions -m "live and not long" tests/live packages/trilat-studies/tests/sweep_tests
+	-o cache_dir=.pytest_cache/sessions -m "live and not long" tests/live packages/trilat-people/tests/live_tests packages/trilat-studies/tests/sweep_tests
 
 sessions: $(VENV)/dev.stamp
 	@$(SESSIONS) || { echo "real-time sessions depend on what else the machine does: those that failed run once more"; \
@@ -88,8 +89,12 @@ push-set: $(VENV)/dev.stamp
 
 test-long: platforms $(VENV)/long.stamp $(VENV)/docs.stamp
 	TRILAT_TEST_RUN=all-tests $(BIN)/python -m pytest -q -p tests.progress -n auto --dist worksteal -m "not live"
-	TRILAT_TEST_RUN=dealt-tests $(BIN)/python -m pytest -q -p tests.progress -p tests.dealt -n auto -m "not live and not long" --ignore tests/live
+	TRILAT_TEST_RUN=dealt-tests $(BIN)/python -m pytest -q -p tests.progress -p tests.dealt -n auto -m "not live and not long" --ignore tests/live --ignore packages/trilat-people/tests/live_tests
 	TRILAT_TEST_RUN=all-sessions $(BIN)/python -m pytest -q -p tests.progress -m live
+	$(MAKE) --no-print-directory packages
+
+packages: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.each_package
 
 containers: setup
 	.ci/compose
@@ -102,7 +107,7 @@ lint: $(VENV)/dev.stamp
 
 platforms: $(VENV)/dev.stamp
 	for other in win32 darwin; do \
-		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_studies -p trilat_ros2 || exit 1; \
+		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_people.experiment -m trilat_people.hand_impedance -p trilat_studies -p trilat_ros2 || exit 1; \
 	done
 
 faults: $(VENV)/dev.stamp

@@ -93,3 +93,15 @@ def describe_load(busy_share: float | None) -> str:
         "so ticks may be late and the recorder may miss records: "
         "end those programs, or lower the rate, as in --set rate_hz=200"
     )
+
+
+def check_machine_load(clock: Clock) -> str:
+    """Measures whether this machine is busy, and returns a warning if it is.
+
+    Args:
+        clock: Clock of this process.
+
+    Returns:
+        The warning, with a remedy. Empty if the machine is not busy.
+    """
+    return describe_load(measure_busy_share(clock))

@@ -433,7 +433,7 @@ class StateBlock:
             )
 
 
-class LoopSite(Protocol):
+class _LoopSite(Protocol):
     """The site whose ticks the loop executes, as far as the loop knows it.
 
     `RunningSite` is the site of a session. The loop ignores the results that are `object`.
@@ -482,7 +482,7 @@ def _publish_sample(
     boot: int,
     clock: Clock,
     timing: SiteTiming,
-    io: LoopSite,
+    io: _LoopSite,
     output: TickRecord,
 ) -> tuple[Any, ...]:
     """Publishes the sample of a tick to the peers.
@@ -515,7 +515,7 @@ def run_loop(
     timing: SiteTiming,
     stats: LoopStats,
     states: StateBlock,
-    io: LoopSite,
+    io: _LoopSite,
     first: int = 0,
     *,
     catches_up: bool = True,

@@ -36,14 +36,15 @@ from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, OffsetLimit
 from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
+from trilat_net.own_code.imported_code import ImportedLaw
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.imported_code import ImportedLaw
 from trilat_net.scenario.operators.program_hand import (
     HandPlayer,
     find_own_hand,
     make_hand_program,
 )
-from trilat_net.scenario.own_plant import OwnPlant, PlantPlayer
+from trilat_net.scenario.own_plant import OwnPlant
+from trilat_net.scenario.plant_player import PlantPlayer
 from trilat_net.scenario.run_changes import make_site_order, to_core_change
 from trilat_net.scenario.scenario_types import SiteOrder
 from trilat_net.signals import Interrupt

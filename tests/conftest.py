@@ -1,19 +1,14 @@
 """Hypothesis profiles, and the runs that many tests look at."""
 
 import gc
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import settings
 
+from . import drawn_examples  # noqa: F401 - loads a profile
 from .push_set import read_long_tests
-
-settings.register_profile("desk", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("ci", settings.get_profile("desk"), derandomize=True, print_blob=True)
-settings.register_profile("push", settings.get_profile("ci"), max_examples=10)
-settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TOPS = {
-    **dict.fromkeys(("trilat_net", "sites", "recorder", "live"), ROOT),
+    **dict.fromkeys(("trilat_net", "sites", "recorder"), ROOT),
+    "trilat_people": ROOT / "packages" / "trilat-people",
     "trilat_studies": ROOT / "packages" / "trilat-studies",
     "trilat_ros2": ROOT / "packages" / "trilat-ros2",
 }
@@ -195,7 +196,6 @@ def unused_methods() -> set[str]:
         "trilat_net",
         "sites",
         "recorder",
-        "live",
         "packages",
         "containers",
         "tests",

@@ -25,7 +25,7 @@ def parse_extras(text: str) -> list[str]:
     """Returns the names in a text, between commas or spaces.
 
     Raises:
-        SystemExit: there is none, or one is no extra; says which there are.
+        SystemExit: there is none, which succeeds and says which there are, or one is no extra.
     """
     extras = list_extras()
     names = [name for name in re.split(r"[\s,]+", text) if name]
@@ -35,6 +35,9 @@ def parse_extras(text: str) -> list[str]:
     usage = "which extras? as in: make extras EXTRAS=view"
     lines = [f"there is no extra {', '.join(unknown)}" if unknown else usage]
     lines += [f"  {name:8} {', '.join(needs)}" for name, needs in extras.items()]
+    if not unknown:
+        print("\n".join(lines))
+        raise SystemExit(0)
     raise SystemExit("\n".join(lines))
 
 

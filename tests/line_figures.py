@@ -23,16 +23,16 @@ from pathlib import Path
 
 from . import house
 
-SOURCES = ("trilat_net", "sites", "recorder", "live", "packages")
+SOURCES = ("trilat_net", "sites", "recorder", "packages")
 PARTS = {
     "ros2": r"ros2|robot_model",
     "lerobot": r"lerobot",
-    "people": r"studies/experiment|cli/experiments|^live/|sites/devices|device_hand|hand_impedance",
+    "people": r"^packages/trilat-people/|studies/experiment",
     "studies": r"^trilat_net/studies/|^packages/trilat-studies/",
     "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|hooks|records|recorded_change)\.py",
     "analysis": r"^trilat_net/analysis/",
     "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__|entry_points|extension|package_names)\.py",
-    "session": r"^trilat_net/(scenario|net|log|execution)/|^sites/|^recorder/",
+    "session": r"^trilat_net/(scenario|own_code|net|log|execution)/|^sites/|^recorder/",
 }
 """The files of each part by their paths; the first pattern that matches decides."""
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from trilat_net.core.life.own_hand import HandContext, HandView
-from trilat_net.scenario.own_plant import PlantContext
+from trilat_net.scenario.plant_player import PlantContext
 from trilat_net.scenario.simulated_arm import SimulatedArm
 
 

@@ -16,7 +16,8 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.golden.surface import all_options
-from tests.json_outline import TABLE, build_table, is_documented
+from tests.json_outline import TABLE, is_documented
+from tests.json_samples import build_table
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, TrilatError, UsageError
 from trilat_net.results import Result

@@ -29,6 +29,7 @@ COMPOSED = re.compile(
     r"|(?:m1|m2|s)[._]\w+(?:\.\w+)*"  # variables of MATLAB files, of a site
     r"|qN_rad|push(?:N|_elbow)_mean_nm"  # metrics of a joint
     r"|gravity[1n]"  # states of a linear loop
+    r"|undelayed_rms_rad"  # a quantity with its unit
     r"|rms_error_rad_(?:mean|half)"  # columns of a sweep with seeds
     r"|did_not_rise|not_judged"  # verdicts, by their texts
     r"|\.\.\._max_\.\.\."

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from trilat_people.devices import haply_inverse3, spacemouse
 from trilat_studies.bench import bench_plan, bench_results, bench_run
 from trilat_studies.sweep import (
     live_confirmation,
@@ -28,8 +29,13 @@ from sites import (
     retransmit_buffer,
     site_end,
 )
-from sites.devices import haply_inverse3, spacemouse
-from trilat_net.analysis import arm_rows, run_end, site_signals, stability_decision
+from trilat_net.analysis import (
+    arm_rows,
+    delay_period,
+    run_end,
+    site_signals,
+    stability_decision,
+)
 from trilat_net.analysis.certificate import observed_energy, premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
@@ -51,7 +57,7 @@ from trilat_net.execution import twins, verify
 from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
-from trilat_net.scenario import delay_period, laws, operators, resolve
+from trilat_net.scenario import laws, operators, resolve
 from trilat_net.work import dask_cluster, executor
 
 ROOT = Path(__file__).parents[1]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from latex2mathml.converter import convert
 
 import trilat_net as tn
 from tests.cli.running import parses, trilat
@@ -46,11 +47,21 @@ def test_every_exception_is_one_and_its_test_is_there() -> None:
 
 def test_every_block_is_run_or_there_is_a_reason() -> None:
     runs = {"sh": COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
-    known = [block for block in BLOCKS if block.language]
+    known = [block for block in BLOCKS if block.language not in ("", "math")]
     assert len(known) > 60
     assert not [
         b.name for b in known if b.page not in runs[b.language] and not find_exception(b)
     ]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_formula_becomes_mathml(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    blocks = [block.text for block in find_blocks(page) if block.language == "math"]
+    for formula in (*blocks, *re.findall(r"\$`([^`]+)`\$", text)):
+        converted = convert(formula.strip())
+        assert converted.startswith("<math")
+        assert "\\" not in converted, formula  # a command that is not known
 
 
 @pytest.mark.parametrize("page", PAGES)

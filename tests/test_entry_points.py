@@ -1,5 +1,6 @@
 """Commands and functions of other packages: which there are, and what is said of those that are missing or broken."""
 
+import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -12,9 +13,9 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import trilat
 from trilat_net import entry_points
-from trilat_net.entry_points import COMMANDS, FUNCTIONS, find_entries
+from trilat_net.entry_points import COMMANDS, FUNCTIONS, HOOKS, VIEWS, find_entries
 from trilat_net.errors import UsageError
-from trilat_net.package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS
+from trilat_net.package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS, PACKAGE_HOOKS
 
 ROOT = Path(__file__).parents[1]
 Installs = Callable[..., None]
@@ -49,6 +50,7 @@ def test_a_package_registers_what_is_said_of_it(package: str) -> None:
     assert set(stated(package)[COMMANDS]) == set(PACKAGE_COMMANDS[package])
     functions = stated(package).get(FUNCTIONS, {})
     assert set(functions) == set(PACKAGE_FUNCTIONS.get(package, "").split())
+    assert set(stated(package).get(HOOKS, {})) == set(PACKAGE_HOOKS.get(package, "").split())
     for group, values in stated(package).items():
         assert {name: find_entries(group)[name].value for name in values} == values
 
@@ -66,7 +68,9 @@ def test_a_missing_package_is_named(installed: Installs, tmp_path: Path) -> None
         for name in commands:
             for more in (["--help"], ["--anything", "else"]):
                 done = trilat(
-                    *name.replace("identify-", "identify ").split(), *more, cwd=tmp_path
+                    *re.sub("^(experiment|identify)-", r"\1 ", name).split(),
+                    *more,
+                    cwd=tmp_path,
                 )
                 done.refuses(f"pip install {package}")
         listed = trilat("--help", cwd=tmp_path).succeeds()
@@ -98,6 +102,29 @@ def test_another_package_adds_a_name_and_replaces_none(
     trilat("greet", cwd=tmp_path).refuses("trilat greet is no command", "extension.command")
     assert "virtual time" in trilat("sim", "--help", cwd=tmp_path).succeeds()
     trilat("sweep", cwd=tmp_path).refuses("pip install trilat-studies")
+
+
+def test_another_package_shows_a_log(
+    installed: Installs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The viewer of that name gets the paths, by the command and by the function alike."""
+    shown: list[list[Path]] = []
+    other = ModuleType("other_package")
+    other.show = lambda files: shown.append(list(files))  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "other_package", other)
+    installed(VIEWS, curves="other_package:show", broken="no_such_package:show")
+    log = ROOT / "tests" / "golden" / "live-paper.mcap"
+    trilat("log", "view", log, "--in", "curves", cwd=tmp_path).succeeds()
+    tn.view(log, viewer="curves")
+    assert shown == [[log], [log]]
+    trilat("log", "view", log, "--in", "broken", cwd=tmp_path).refuses("cannot be imported")
+    unknown = trilat("log", "view", log, "--in", "other", cwd=tmp_path)
+    unknown.refuses("no viewer 'other'", "broken, curves")
+    both = trilat("log", "view", log, "--in", "curves", "--foxglove", cwd=tmp_path)
+    both.refuses("--in cannot be combined")
+    with pytest.raises(UsageError, match="viewer cannot be combined"):
+        tn.view(log, viewer="curves", rviz=True)
+    assert len(shown) == 2
 
 
 def test_a_broken_package_stops_no_other_command(installed: Installs, tmp_path: Path) -> None:

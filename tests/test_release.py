@@ -5,19 +5,27 @@ import re
 import shutil
 import subprocess
 import sys
-import tarfile
 import tomllib
 import zipfile
-from importlib.metadata import Distribution, distribution, entry_points
+from importlib.metadata import distribution, entry_points
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from packaging.requirements import Requirement
 
 from tests.cli.running import parses
-from trilat_net.files import STUDY_LIBRARIES
+from tests.distributions import (
+    CORE,
+    OF_PACKAGES,
+    PACKAGES,
+    WHOLE,
+    build,
+    install,
+    make_sources,
+    names_of,
+    run,
+)
 from trilat_net.net.connection import find_free_endpoints
 
 ROOT = Path(__file__).parents[1]
@@ -106,10 +114,6 @@ def test_a_release_is_built_once_and_published_without_a_secret() -> None:
     assert PROJECT["project"]["requires-python"] == f">={stated[0]}"
 
 
-def names_of(stated: list[str]) -> set[str]:
-    return {re.split(r"[^\w-]", one)[0] for one in stated}
-
-
 def locked(name: str) -> set[str]:
     text = (ROOT / "requirements" / f"{name}.lock").read_text(encoding="utf-8")
     return set(re.findall(r"^([\w-]+)==", text, re.MULTILINE))
@@ -166,26 +170,6 @@ def test_both_names_of_the_program_are_one() -> None:
     assert made == scripts["trilat"]
 
 
-def run(*words: object, cwd: Path, **more: str) -> str:
-    """Runs a program outside of the checkout; returns what it printed."""
-    bare = {
-        key: value
-        for key, value in os.environ.items()
-        if not key.startswith(("PYTHON", "VIRTUAL"))
-    }
-    done = subprocess.run(
-        [str(word) for word in words],
-        cwd=cwd,
-        env={**bare, **more},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
-
-
-CORE, WHOLE = "trilat-net-core", "trilat-net"
-PACKAGES = [path.parent.name for path in sorted(ROOT.glob("packages/trilat-*/pyproject.toml"))]
 EXAMPLE = "trilat-lag"
 
 
@@ -193,25 +177,16 @@ EXAMPLE = "trilat-lag"
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of what each distribution is built from."""
     folder = tmp_path_factory.mktemp("sources")
-    run(sys.executable, ROOT / ".ci" / "distributions", folder / "made", cwd=folder)
-    return folder / "made"
+    return make_sources(folder / "made")
 
 
 @pytest.fixture(scope="module")
 def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
     """By distribution its sdist, and the wheel that is made of that sdist."""
-    build = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
     made = {}
     shutil.copytree(ROOT / "examples" / "package", sources / EXAMPLE)
     for name in (CORE, *PACKAGES, WHOLE, EXAMPLE):
-        folder = tmp_path_factory.mktemp("built")
-        run(sys.executable, "-c", build, "build_sdist", folder, cwd=sources / name)
-        (sdist,) = folder.glob("*.tar.gz")
-        with tarfile.open(sdist) as archive:
-            archive.extractall(folder / "unpacked", filter="data")
-        (unpacked,) = (folder / "unpacked").iterdir()
-        run(sys.executable, "-c", build, "build_wheel", folder, cwd=unpacked)
-        made[name] = [sdist, *folder.glob("*.whl")]
+        made[name] = build(sources / name, tmp_path_factory.mktemp("built"))
     return made
 
 
@@ -232,7 +207,7 @@ def test_both_distributions_are_one_program_of_one_version(sources: Path) -> Non
     brought = [f"{name}=={VERSION}" for name in (CORE, *PACKAGES)]
     added = whole["dependencies"][len(brought) :]
     assert whole["dependencies"][: len(brought)] == brought
-    assert names_of(added) == set(STUDY_LIBRARIES)
+    assert names_of(added) == OF_PACKAGES
     assert sorted([*core["dependencies"], *added]) == sorted(PROJECT["project"]["dependencies"])
     assert {**core["scripts"], **whole["scripts"]} == PROJECT["project"]["scripts"]
     assert not core["scripts"].keys() & whole["scripts"].keys()
@@ -248,44 +223,9 @@ def test_a_package_has_the_version_and_bounds_of_the_program(name: str, sources:
     assert (released["project"]["version"], first) == (VERSION, f"{CORE}=={VERSION}")
     assert "dynamic" not in released["project"]
     assert set(libraries) <= set(PROJECT["project"]["dependencies"])
+    of_tests = released.get("dependency-groups", {}).get("test", [])
+    assert names_of(of_tests) <= locked("dev")
     assert distribution(name).version == VERSION
-
-
-def needed(names: set[str]) -> dict[str, Distribution]:
-    """These distributions of this environment, and all that they need."""
-    found: dict[str, Distribution] = {}
-    left = set(names)
-    while left:
-        one = found[name] = distribution(name := left.pop())
-        stated = map(Requirement, one.requires or [])
-        left |= {
-            r.name for r in stated if not r.marker or r.marker.evaluate({"extra": ""})
-        } - found.keys()
-    return found
-
-
-def install(clean: Path, wheel: Path, libraries: set[str]) -> Path:
-    """Installs a wheel into an environment, and libraries from this one; returns its `site-packages`."""
-    onto = [
-        "-m",
-        "pip",
-        "--python",
-        clean / "bin" / "python",
-        "install",
-        "--no-deps",
-        "--no-index",
-        wheel,
-    ]
-    run(sys.executable, *onto, cwd=clean)
-    (packages,) = (clean / "lib").glob("python3*/site-packages")
-    for one in needed(libraries).values():
-        for top in {
-            file.parts[0]
-            for file in one.files or []
-            if file.parts[0] not in ("..", "__pycache__")
-        }:
-            (packages / top).exists() or (packages / top).symlink_to(one.locate_file(top))
-    return packages
 
 
 @pytest.mark.live
@@ -296,7 +236,7 @@ def test_a_robot_runs_trilat_net_core_alone(
     """Without a network: libraries are of this environment, the program is the wheel's; then both wheels'."""
     with zipfile.ZipFile(built[CORE][1]) as archive:
         names = set(archive.namelist())
-    packages = ("trilat_net", "sites", "recorder", "live")
+    packages = ("trilat_net", "sites", "recorder")
     code = {
         str(one.relative_to(ROOT)) for name in packages for one in (ROOT / name).rglob("*.py")
     }
@@ -307,8 +247,8 @@ def test_a_robot_runs_trilat_net_core_alone(
     clean = tmp_path / "clean"
     run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
     stated = names_of(PROJECT["project"]["dependencies"])
-    where = install(clean, built[CORE][1], stated - set(STUDY_LIBRARIES))
-    heavy = "matplotlib", "scipy", "loky", "pandas", "polars", "pydantic"
+    where = install(clean, built[CORE][1], stated - OF_PACKAGES)
+    heavy = *OF_PACKAGES, "pandas", "polars", "pydantic"
     assert not [name for name in heavy if (where / name).exists()]
     trilat = clean / "bin" / "trilat"
     run(trilat, "keys", "new", "keys", "m", "s", "recorder", cwd=tmp_path)
@@ -351,12 +291,24 @@ import trilat_net as tn
 print(tn.simulate("two_sites", duration_s=0.1)["m"].q.shape)
 import recorder.record_process, sites.site_process, trilat_net.app.doctor
 from trilat_net.errors import UsageError
-try:
-    tn.sweep("two_sites")
-except UsageError as error:
-    print(error)
-print([name for name in sys.modules if name.startswith("trilat_studies")])
+for use in (tn.sweep, tn.run_experiment, tn.SpaceMouse):
+    try:
+        use("two_sites")
+    except UsageError as error:
+        print(error)
+packages = ("trilat_people", "trilat_ros2", "trilat_studies", "websockets")
+print([name for name in sys.modules if name.partition(".")[0] in packages])
 """
+
+
+MISSING = {
+    "sweep": "trilat-studies",
+    "live": "trilat-people",
+    "hand": "trilat-people",
+    "experiment run": "trilat-people",
+    "ros2": "trilat-ros2",
+}
+"""Commands that the core lacks, and the packages that they are in."""
 
 
 @pytest.mark.long
@@ -367,27 +319,51 @@ def test_packages_and_those_of_others_join_the_core(
     clean = tmp_path / "clean"
     run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
     stated = names_of(PROJECT["project"]["dependencies"])
-    install(clean, built[CORE][1], stated - set(STUDY_LIBRARIES))
+    install(clean, built[CORE][1], stated - OF_PACKAGES)
     python, trilat = clean / "bin" / "python", clean / "bin" / "trilat"
     printed = run(python, "-c", ALONE, cwd=tmp_path).splitlines()
-    assert printed[-3] == "(100, 2)"
-    assert "pip install trilat-studies" in printed[-2]
+    assert printed[-5] == "(100, 2)"
+    assert "pip install trilat-studies" in printed[-4]
+    assert "pip install trilat-people" in printed[-3]
+    assert "pip install trilat-people" in printed[-2]
     assert printed[-1] == "[]"
-    refused = subprocess.run([trilat, "sweep", "two_sites"], capture_output=True, text=True)
-    assert refused.returncode == 2
-    assert refused.stderr.splitlines() == [
-        "error: trilat sweep is in a package of its own: pip install trilat-studies"
-    ]
+    for command, package in MISSING.items():
+        words = command.split()
+        refused = subprocess.run([trilat, *words, "two_sites"], capture_output=True, text=True)
+        assert refused.returncode == 2
+        assert refused.stderr.splitlines() == [
+            f"error: trilat {command} is in a package of its own: pip install {package}"
+        ]
     install(clean, built[EXAMPLE][1], set())
     assert "lag " in run(trilat, "--help", cwd=tmp_path)
     words = ("lag", "two_sites", "--seeds", "2", "--duration", "0.1")
     assert len(run(trilat, *words, cwd=tmp_path).splitlines()) == 2
     called = "import trilat_net as tn; print(len(tn.measure_lags('two_sites', 2, 0.1)))"
     assert run(python, "-c", called, cwd=tmp_path) == "2\n"
+    run(trilat, "sim", "two_sites", "--duration", "2", "-o", "lagging.mcap", cwd=tmp_path)
+    lines = run(trilat, "log", "view", "lagging.mcap", "--in", "lag", cwd=tmp_path).splitlines()
+    assert [line.partition(":")[0] for line in lines] == [
+        "m, 0 s",
+        "m, 1 s",
+        "s, 0 s",
+        "s, 1 s",
+    ]
     install(clean, built["trilat-studies"][1], stated)
     grid = ("--over", "link.delay_ms=0,100", "--duration", "0.5", "--jobs", "1", "-o", "grid")
     run(trilat, "sweep", "two_sites", *grid, cwd=tmp_path)
     assert (tmp_path / "grid" / "results.csv").is_file()
+    install(clean, built["trilat-people"][1], stated)
+    run(trilat, "experiment", "new", "reach.toml", cwd=tmp_path)
+    assert "trials" in run(trilat, "experiment", "check", "reach.toml", cwd=tmp_path)
+    page = "import trilat_people.live_page.page_files as p; print(*sorted(p._list_assets()))"
+    assert "/three.module.min.js" in run(python, "-c", page, cwd=tmp_path).split()
+
+
+def test_the_page_of_installation_names_every_package() -> None:
+    """`pip install .` alone would leave out the packages that lie in a folder of their own."""
+    text = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^python -m pip install --no-deps \. (.*)$", text, re.MULTILINE)
+    assert line.split() == [f"./packages/{name}" for name in PACKAGES]
 
 
 @pytest.mark.long

@@ -9,8 +9,8 @@ from typing import Any
 
 from tests.transmission import VARIANTS
 from tests.virtual_runs import Array, sampled
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.code_consent import allow_own_code
 
 ARM = {
     "l1_m": 1.0,

@@ -26,9 +26,21 @@ from . import presentation as _presentation  # noqa: F401
 from .package_names import PACKAGE_FUNCTIONS as _PACKAGE_FUNCTIONS
 
 if _TYPE_CHECKING:
+    from trilat_people.devices.haply_inverse3 import HaplyInverse3 as HaplyInverse3
+    from trilat_people.devices.spacemouse import SpaceMouse as SpaceMouse
+    from trilat_people.experiment.experiment_analysis import (
+        analyse_experiment as analyse_experiment,
+    )
+    from trilat_people.experiment.experiment_analysis import (
+        compute_experiment_power as compute_experiment_power,
+    )
+    from trilat_people.experiment.experiment_run import check_experiment as check_experiment
+    from trilat_people.experiment.experiment_run import new_experiment as new_experiment
+    from trilat_people.experiment.experiment_run import open_experiment as open_experiment
+    from trilat_people.experiment.experiment_run import run_experiment as run_experiment
+    from trilat_people.hand_impedance import identify_hand as identify_hand
     from trilat_studies.arm_gains import tune_arm as tune_arm
     from trilat_studies.gym_environment import make_env as make_env
-    from trilat_studies.hand_impedance import identify_hand as identify_hand
     from trilat_studies.log_comparison import compare as compare
     from trilat_studies.study_functions import bench as bench
     from trilat_studies.study_functions import margin as margin
@@ -37,12 +49,10 @@ if _TYPE_CHECKING:
     from trilat_studies.trials import check as check
     from trilat_studies.trials import trials as trials
 
-    from sites.devices import Device as Device
-    from sites.devices import DeviceState as DeviceState
-    from sites.devices.haply_inverse3 import HaplyInverse3 as HaplyInverse3
-    from sites.devices.spacemouse import SpaceMouse as SpaceMouse
     from trilat_net.app.demo_session import run as run
     from trilat_net.app.doctor import doctor as doctor
+    from trilat_net.app.input_device import Device as Device
+    from trilat_net.app.input_device import DeviceState as DeviceState
     from trilat_net.app.network_benchmark import ping_benchmark as ping_benchmark
     from trilat_net.app.running_session import hand as hand
     from trilat_net.app.running_session import session as session
@@ -84,28 +94,18 @@ if _TYPE_CHECKING:
     from .scenario import read_template as read_template
     from .scenario.delay_traces import import_trace as import_trace
     from .scenario.describe import describe_scenario as describe_scenario
-    from .scenario.own_plant import PlantContext as PlantContext
+    from .scenario.plant_player import PlantContext as PlantContext
     from .scenario.simulated_arm import SimulatedArm as SimulatedArm
     from .scenario.skeletons import new_hand as new_hand
     from .scenario.skeletons import new_law as new_law
     from .scenario.skeletons import new_plant as new_plant
-    from .studies.experiment.experiment_analysis import analyse_experiment as analyse_experiment
-    from .studies.experiment.experiment_analysis import (
-        compute_experiment_power as compute_experiment_power,
-    )
-    from .studies.experiment.experiment_run import check_experiment as check_experiment
-    from .studies.experiment.experiment_run import new_experiment as new_experiment
-    from .studies.experiment.experiment_run import open_experiment as open_experiment
-    from .studies.experiment.experiment_run import run_experiment as run_experiment
 
     __version__: str
 
 _NAMES = {
     "trilat_net.app.demo_session": "run",
-    "sites.devices": "Device DeviceState",
-    "sites.devices.haply_inverse3": "HaplyInverse3",
-    "sites.devices.spacemouse": "SpaceMouse",
     "trilat_net.app.doctor": "doctor",
+    "trilat_net.app.input_device": "Device DeviceState",
     "trilat_net.app.network_benchmark": "ping_benchmark",
     "trilat_net.app.running_session": "hand session start",
     "trilat_net.analysis.file_overview": "info",
@@ -127,13 +127,9 @@ _NAMES = {
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",
     "trilat_net.scenario.delay_traces": "import_trace",
-    "trilat_net.scenario.own_plant": "PlantContext",
+    "trilat_net.scenario.plant_player": "PlantContext",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
-    "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment "
-    "compute_experiment_power",
-    "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment "
-    "open_experiment run_experiment",
 }
 """The public names that each module defines, separated by spaces."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

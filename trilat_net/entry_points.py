@@ -1,4 +1,4 @@
-"""Finds the commands and functions that other installed packages add to this program.
+"""Finds the commands, functions and viewers that other installed packages add to this program.
 
 A package adds them by entry points, a section of its pyproject.toml that names objects
 (docs/develop/packages.md). This program reads the names without importing the package. It
@@ -12,22 +12,32 @@ Invariant:
     - A name of a package of this program is never taken from another package.
 """
 
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
 from .errors import UsageError
-from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS
+from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS, PACKAGE_HOOKS
 
 COMMANDS = "trilat_net.commands"
 """Group of the commands. A name is that of the command, with a hyphen for each space."""
 FUNCTIONS = "trilat_net.api"
 """Group of the functions and classes of the Python interface."""
+VIEWS = "trilat_net.views"
+"""Group of the viewers that `trilat log view --in` opens a log in, by their names."""
+HOOKS = "trilat_net.hooks"
+"""Group of what methods of this program call in packages of this program, see `hooks`."""
 
 _PACKAGE_OF = {
     COMMANDS: {name: package for package, names in PACKAGE_COMMANDS.items() for name in names},
     FUNCTIONS: {
         name: package for package, names in PACKAGE_FUNCTIONS.items() for name in names.split()
+    },
+    VIEWS: {},
+    HOOKS: {
+        name: package for package, names in PACKAGE_HOOKS.items() for name in names.split()
     },
 }
 
@@ -37,7 +47,7 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
     """Returns the entry points of a group by their names, without importing their packages.
 
     Args:
-        group: `COMMANDS` or `FUNCTIONS`.
+        group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
     """
     entries: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
@@ -52,7 +62,7 @@ def find_package(group: str, name: str) -> str:
     """Returns the package of this program that has a name, or "" if none has.
 
     Args:
-        group: `COMMANDS` or `FUNCTIONS`.
+        group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
         name: Name of the entry point.
     """
     return _PACKAGE_OF[group].get(name, "")
@@ -62,7 +72,7 @@ def load_entry(group: str, name: str, use: str) -> Any:
     """Imports the object of an entry point.
 
     Args:
-        group: `COMMANDS` or `FUNCTIONS`.
+        group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
         name: Name of the entry point.
         use: What the object is to a user, as in "trilat sweep", for the error.
 
@@ -88,3 +98,23 @@ def load_entry(group: str, name: str, use: str) -> Any:
         raise UsageError(
             f"{use} cannot be used, because {entry.value} cannot be imported: {reason}"
         ) from error
+
+
+def find_viewer(name: str) -> Callable[[Sequence[Path]], None]:
+    """Returns the function by which another package shows logs, from the group `VIEWS`.
+
+    The function gets the paths of the log or of its parts, and returns when the log is shown.
+
+    Args:
+        name: Name of the viewer.
+
+    Raises:
+        UsageError: No installed package has a viewer of that name, or it cannot be imported.
+    """
+    show_logs: Callable[[Sequence[Path]], None] | None = load_entry(
+        VIEWS, name, f"the viewer {name}"
+    )
+    if show_logs is None:
+        names = ", ".join(sorted(find_entries(VIEWS))) or "none"
+        raise UsageError(f"there is no viewer {name!r}; installed packages have: {names}")
+    return show_logs

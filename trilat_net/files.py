@@ -83,7 +83,7 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
         ModuleNotFoundError: The missing module belongs to this program, which is a bug.
     """
     package = (error.name or "").partition(".")[0]
-    if package in ("", "live", "recorder", "sites", "trilat_net"):
+    if package in ("", "recorder", "sites", "trilat_net"):
         raise error
     distribution = package.replace("_", "-")
     if distribution in PACKAGE_COMMANDS:
@@ -204,77 +204,6 @@ def open_regular(path: Path, **options: Any) -> Any:
         stream.close()
         raise OSError(errno.EINVAL, "the path is a pipe or a device, not a file", str(path))
     return stream
-
-
-_OTHER_KINDS = {
-    b"\x89MCAP": "an MCAP file",
-    b"\xd0\xcf\x11\xe0": "a spreadsheet or document of an old Office program (.xls, .doc)",
-    b"\x1f\x8b": "a gzip file",
-    b"%PDF": "a PDF document",
-    b"SQLite": "an SQLite database",
-}
-"""Kinds of files that are not text, by their first bytes."""
-_ZIPPED_KINDS = {
-    b"xl/workbook": "a spreadsheet (.xlsx)",
-    b"opendocument.spreadsheet": "a spreadsheet (.ods)",
-    b"Index/Tables": "a spreadsheet (.numbers)",
-    b"word/document": "a text document (.docx)",
-}
-"""Kinds of documents in ZIP archives, by a text that the archive contains uncompressed."""
-
-
-def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
-    """Decodes the content of a text file.
-
-    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it.
-
-    Some bytes at the start of the content, such as a byte order mark, show the encoding.
-
-    Args:
-        raw: Content of the file.
-        any_code_page: True to decode a text in another encoding as Latin-1, because programs on
-            Windows print in the code page of their country. Letters beyond ASCII may then be
-            wrong.
-
-    Returns:
-        The text, without a byte order mark.
-
-    Raises:
-        ValueError: The content is not text. The message names the kind of file, for example a
-            spreadsheet.
-    """
-    is_zip_archive = raw[:4] == b"PK\x03\x04"
-    if is_zip_archive:
-        kinds = [kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw]
-        raise ValueError(_describe_kind(kinds[0] if kinds else "a ZIP archive"))
-    for mark, kind in _OTHER_KINDS.items():
-        if raw.startswith(mark):
-            raise ValueError(_describe_kind(kind))
-
-    has_utf16_mark = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
-    if has_utf16_mark:
-        return raw.decode("utf-16")
-    # UTF-16 without a byte order mark: each pair of bytes of ASCII text has one zero.
-    if raw[:2].count(0) == 1:
-        return raw.decode("utf-16-be" if raw[0] == 0 else "utf-16-le")
-    if 0 in raw:
-        raise ValueError("is not text: the file contains null bytes")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        if not any_code_page:
-            raise
-        return raw.decode("latin-1")
-
-
-def _describe_kind(kind: str) -> str:
-    """Returns the problem of a file that is not text, and what the user can do about it.
-
-    Args:
-        kind: The kind of file, with its article, as in "a PDF document".
-    """
-    advice = "save the sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
-    return f"is {kind}, not text: {advice}"
 
 
 @contextmanager

@@ -4,6 +4,7 @@ python docs/site/make_pages.py [--no-pictures]
 zensical build --strict -f build/site/zensical.toml
 """
 
+import csv
 import inspect
 import re
 import shutil
@@ -11,6 +12,8 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+from latex2mathml.converter import convert
 
 import trilat_net as tn
 from trilat_net.presentation.figures.registry import write_figures
@@ -21,6 +24,8 @@ SITE = ROOT / "build" / "site"
 PAGES = SITE / "docs"
 BESIDE = ("CHANGELOG.md", "SECURITY.md", "LICENSE")
 """Pages that stand beside docs in the repository, and in it here."""
+MOST_ROWS = 250
+"""Largest number of rows of a data file that its page shows."""
 
 
 def main() -> None:
@@ -32,6 +37,10 @@ def main() -> None:
     write("index.md", read_beside_docs("README.md"))
     for page in PAGES.rglob("*.md"):
         lift_links_beside_docs(page)
+        link_to_rendered_tables(page)
+        typeset_formulas(page)
+    for table in sorted((PAGES / "data").glob("*.csv")):
+        write(f"data/{table.stem}.md", render_table(table))
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
@@ -61,6 +70,60 @@ def lift_links_beside_docs(page: Path) -> None:
     inside = outside.removesuffix("../")
     text = page.read_text(encoding="utf-8").replace(f"{outside}README.md", f"{inside}index.md")
     page.write_text(text.replace(outside, inside), encoding="utf-8")
+
+
+def link_to_rendered_tables(page: Path) -> None:
+    """Makes the links of a page to data files lead to the pages that show them as tables."""
+    text = page.read_text(encoding="utf-8")
+    page.write_text(
+        re.sub(r"\]\(((?:\.\./)*data/[\w-]+)\.csv\)", r"](\1.md)", text), encoding="utf-8"
+    )
+
+
+def typeset_formulas(page: Path) -> None:
+    """Turns the formulas of a page into MathML, which browsers draw without a script.
+
+    They are written as on GitHub: ```math before a block, and $`...`$ in a line. Each stands in
+    an element of HTML, because a line that begins with a formula would count as a block.
+    """
+    text = page.read_text(encoding="utf-8")
+    text = re.sub(
+        r"^```math\n(.*?)^```$",
+        lambda found: f'<div style="margin: 1em 0">{convert_formula(found[1], "block")}</div>',
+        text,
+        flags=re.DOTALL | re.MULTILINE,
+    )
+    text = re.sub(
+        r"\$`([^`]+)`\$",
+        lambda found: f"<span>{convert_formula(found[1], 'inline')}</span>",
+        text,
+    )
+    page.write_text(text, encoding="utf-8")
+
+
+def convert_formula(latex: str, display: str) -> str:
+    """Returns a formula as MathML. Blanks are removed, because Markdown would see paragraphs."""
+    return re.sub(r"\s*\n\s*", " ", convert(latex.strip(), display=display))
+
+
+def render_table(path: Path) -> str:
+    """Returns a data file as a page: its first rows as a table, and a link to the file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        heads, *rows = list(csv.reader(file))
+    title = path.stem.replace("-", " ").replace("_", " ")
+    download = f"[Download {path.name}]({path.name}), which has {len(rows)} rows."
+    if len(rows) > MOST_ROWS:
+        download += f" Here are the first {MOST_ROWS}."
+    lines = [heads, ["---"] * len(heads), *rows[:MOST_ROWS]]
+    table = "\n".join(f"| {' | '.join(map(escape_cell, line))} |" for line in lines)
+    return f"# {title[:1].upper()}{title[1:]}\n\n{download}\n\n{table}"
+
+
+def escape_cell(text: str) -> str:
+    """Returns the text of a cell so that Markdown shows it as it is, apart from code in backticks."""
+    parts = text.replace("|", "\\|").replace("<", "&lt;").split("`")
+    parts[::2] = [re.sub(r"([*_\[\]])", r"\\\1", part) for part in parts[::2]]
+    return "`".join(parts)
 
 
 def list_commands() -> str:

@@ -1,9 +1,12 @@
-"""Adds the command `trilat lag` and the function `trilat_net.measure_lags`.
+"""Adds the command `trilat lag`, the function `trilat_net.measure_lags`, and a viewer of logs.
 
 pip install .
 trilat lag paper --seeds 3
+trilat log view run.mcap --in lag
 """
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import trilat_net as tn
@@ -49,3 +52,17 @@ def lag_command(
         return
     for number, lag_rad in enumerate(lags_rad, start=1):
         print_line(f"seed {number}: {lag_rad:.4f} rad")
+
+
+def show_lags(files: Sequence[Path]) -> None:
+    """Prints how far each arm of a log was from the others at most, second by second.
+
+    Args:
+        files: The log, or its parts.
+    """
+    log = tn.open_log(*files)
+    for name, arm in log.items():
+        for second in range(int(arm.t_s[-1]) + 1):
+            errors_rad = arm.e[(arm.t_s >= second) & (arm.t_s < second + 1)]
+            if len(errors_rad):
+                print_line(f"{name}, {second} s: {abs(errors_rad).max():.4f} rad")

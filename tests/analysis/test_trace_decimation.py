@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from trilat_net.analysis.site_signals import decimate, extreme_rows
+from trilat_net.presentation.plot_signals import decimate, extreme_rows
 
 numbers = st.one_of(st.floats(-1e6, 1e6), st.just(np.nan))
 columns = hnp.arrays(

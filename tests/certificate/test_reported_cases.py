@@ -21,8 +21,8 @@ from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.execution.fused import FusedRun
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.code_consent import allow_own_code
 
 from ..virtual_runs import simulate_with_commands
 from .sampled_loops import SampledLoop, burst, constant, sine

@@ -14,10 +14,11 @@ from trilat_net.analysis.certificate.observed_energy import (
     NEGATIVE_ENERGY_MEANING,
     ObservedFinding,
 )
+from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.run_end import Stability
 from trilat_net.execution.twins import Push, run_virtual_twins
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.describe import describe_law_conditions, list_law_proofs
+from trilat_net.scenario.describe import describe_law_conditions
 
 from ..unit_arm import unit_scenario
 from .sampled_loops import SampledLoop, constant, sine

@@ -15,8 +15,8 @@ from typer.main import get_command
 
 from trilat_net.app.cli import app, main
 from trilat_net.core.step.jit import compiling_notice
+from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.presentation import terminal_output
-from trilat_net.scenario.imported_code import allowed_code
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
 """The same as a process of its own."""

@@ -19,14 +19,14 @@ from tests.cli.running import COMMAND, PLAIN, shorten, trilat
 from tests.log_editing import edited, opened
 from trilat_net.app.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
-from trilat_net.presentation.figures.registry import list_drawable_figures
-from trilat_net.scenario.code_consent import list_imported_code
-from trilat_net.scenario.imported_code import (
+from trilat_net.own_code.code_consent import list_imported_code
+from trilat_net.own_code.imported_code import (
     CodeKey,
     allowed_code,
     import_class,
     remembered_settings,
 )
+from trilat_net.presentation.figures.registry import list_drawable_figures
 
 WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
 """A module that begins so tells that it was imported."""

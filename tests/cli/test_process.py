@@ -236,8 +236,8 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
         ("log", "check", "run.mcap"),
     ]
     program = ALONE.format(
-        blocked=[*STUDY_LIBRARIES, "pandas", "polars"],
-        rooms=["sites", "recorder", "live", *(f"trilat_net.{room}" for room in ROOMS)],
+        blocked=[*STUDY_LIBRARIES, "pandas", "polars", "websockets"],
+        rooms=["sites", "recorder", *(f"trilat_net.{room}" for room in ROOMS)],
         commands=[*alone, *NEED_STUDIES],
     )
     done = subprocess.run(

@@ -15,9 +15,10 @@ from tests.energy_runs import JITTER, LAWS, MOBILE, drawn, least_energy, pair, t
 from tests.log_editing import opened
 from tests.unit_arm import H50, hand, unit_scenario
 from tests.virtual_runs import sampled, trajectories
+from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
-from trilat_net.scenario.describe import describe_law_conditions, list_law_proofs
+from trilat_net.scenario.describe import describe_law_conditions
 
 TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40.0}
 

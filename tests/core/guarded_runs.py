@@ -11,8 +11,8 @@ from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.messages import RESTING_MODES
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.code_consent import allow_own_code
 from trilat_net.scenario.run_changes import make_site_order, to_core_change
 
 TEXT = """

@@ -18,7 +18,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
-from trilat_net.log.ros2.viz_channels import FULL_RATE_HZ
+from trilat_net.log.view_rates import FULL_RATE_HZ
 from trilat_net.presentation.rerun_viewer import build_plot_layout
 from trilat_net.scenario import load_scenario
 

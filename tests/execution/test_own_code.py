@@ -14,10 +14,10 @@ from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_scenario
 from trilat_net.log.log_reader import Log
+from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.imported_code import allowed_code
 from trilat_net.scenario.operators.program_hand import HandPlayer, find_own_hand
-from trilat_net.scenario.own_plant import make_plant_players
+from trilat_net.scenario.plant_player import make_plant_players
 
 SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
 
@@ -99,7 +99,8 @@ def test_a_hand_sees_its_peers_after_the_delay() -> None:
 @pytest.mark.usefixtures("kept_consents")
 @pytest.mark.parametrize("how", ["raise", "nan", "many", "far", "text"])
 def test_a_hand_that_fails_lets_go_for_good(how: str) -> None:
-    log = tn.simulate("paper", at_m2("Failing", settings={"how": how, "at_s": 0.3}))
+    with pytest.warns(RuntimeWarning, match="Failing failed at tick 300"):
+        log = tn.simulate("paper", at_m2("Failing", settings={"how": how, "at_s": 0.3}))
     told = [event.text for event in log.events if event.kind == "hand"]
     assert [text for text in told if "tests.own_code:Failing failed at tick 300: " in text]
     assert [text for text in told if "is not asked again" in text]

@@ -15,8 +15,8 @@ from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.own_code.code_consent import find_user_laws
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.code_consent import find_user_laws
 from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 
 LAW = "tests.laws:Adaptive"

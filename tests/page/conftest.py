@@ -1,17 +1,3 @@
-"""A page's server without a session, and the browser in which its pages are opened."""
+"""The browser in which pages are opened."""
 
-from collections.abc import Iterator
-
-import pytest
-
-from live.page_server import PageServer
 from tests.live.browsers import browser  # noqa: F401
-from tests.net.local_bus import LocalNetwork
-from trilat_net.net.clock import SystemClock
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """The address of a page server of session `s1`, for the experimenter."""
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
-        yield server.address

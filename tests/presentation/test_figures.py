@@ -11,6 +11,7 @@ import trilat_net
 from tests.analysis import logs
 from tests.task_arms import planar_task
 from trilat_net.analysis import site_signals
+from trilat_net.analysis.link_summary import DelayDistribution
 from trilat_net.analysis.timeline import find_mode_intervals
 from trilat_net.errors import UsageError
 from trilat_net.presentation import style
@@ -135,7 +136,7 @@ def test_distributions_reach_longest_age_and_rare_one_by_logarithm():
     for few, even in ((20.0, True), (1.0, False)):
         ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
         x_ms = age_and_lateness.choose_delay_axis_ms(
-            [age_and_lateness.DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)]
+            [DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)]
         )
         assert x_ms[-1] >= 3200.0
         assert (x_ms[0] == 0.0) == even

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 from markupsafe import Markup
+from trilat_people.live_page.page_opening import BrowserOpening
 
 import trilat_net
-from live.page_opening import BrowserOpening
 from tests.analysis import logs
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run

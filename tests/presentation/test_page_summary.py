@@ -12,7 +12,9 @@ from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
+from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.run_view import RunView
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
@@ -146,6 +148,10 @@ def test_key_numbers_say_where_and_when() -> None:
         last = max(facts["sites"][site]["max_error_end_rad"] for site in sites)
         assert f"<dt>{name}" in html
         assert f"joint {joint + 1}, at {peak.t_s:.2f} s; {last:.3g} rad in the last" in html
+    undelayed_rad = measure_undelayed_error(RunView(log), "s")["undelayed_max_rad"].value
+    assert undelayed_rad is not None
+    tile = f"<dt>s from where the masters are</dt><dd>{undelayed_rad:.3g} rad</dd>"
+    assert tile in html
     # the remote arm is first
     assert html.index("<dt>s from") < html.index("<dt>m1 and m2 from")
     assert "<dd>200 ms</dd>" in html

@@ -7,7 +7,7 @@ import pytest
 
 import tests.own_laws
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario.class_arguments import check_arguments, make_own_instance
+from trilat_net.own_code.class_arguments import check_arguments, make_own_instance
 
 
 class Any1:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from sites.devices import DeviceState, Vector
+from trilat_net.app.input_device import DeviceState, Vector
 from trilat_net.net.clock import Clock
 
 ZERO = (0.0, 0.0, 0.0)

@@ -41,6 +41,16 @@ def test_a_measurement_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> N
         assert found.text.endswith("failed (exit code 1: MemoryError: no more pages)")
 
 
+def test_processes_of_their_own_measure() -> None:
+    short = "from trilat_net.app import doctor; doctor.RATES_HZ = (100,); doctor.REHEARSAL_S = 0.05\n"
+    ((rate_hz, late_us, largest_us),) = doctor._run_in_process(short + doctor._RATES_CODE)
+    assert rate_hz == 100
+    assert 0 <= late_us <= largest_us
+    assert {"scheduling", "memory", "timer_slack"} <= set(
+        doctor._run_in_process(doctor._RIGHTS_CODE)
+    )
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("deployment") / "keys"
@@ -231,6 +241,7 @@ def test_the_rate_is_told_with_how_late_ticks_were(
     assert text in found.text
 
 
+@pytest.mark.push
 def test_a_real_loop_is_measured_in_its_own_process() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 

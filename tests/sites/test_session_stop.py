@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from trilat_people.live_page.session_frames import SessionFrames, render_event
+from trilat_people.live_page.terminal_watch import SessionWatch
 
-from live.session_frames import SessionFrames, render_event
-from live.terminal_watch import SessionWatch
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms

@@ -10,6 +10,7 @@ from trilat_studies.sweep.stability_map import evaluate_criterion
 
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import count_growing, position_network, rods
+from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.core.links.dominance import find_balancing_weights
@@ -20,7 +21,7 @@ from trilat_net.laws.conditions import (
     judge_position_exchange,
 )
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.describe import describe_law_conditions, list_law_proofs
+from trilat_net.scenario.describe import describe_law_conditions
 
 LAB = [[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]]
 """The lab sheet's first exercise: 0.1 0.2 0.8 = 0.016 along the circle, 0.9 0.2 0.8 = 0.144 back."""

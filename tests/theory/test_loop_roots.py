@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import trilat_net as tn
 from tests.virtual_runs import simulate_with_commands
+from trilat_net.analysis.delay_period import find_burst_interval_s, find_final_delay_period
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.analysis.theory.loop_roots import (
@@ -21,7 +22,6 @@ from trilat_net.analysis.theory.loop_roots import (
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.delay_period import find_burst_interval_s, find_final_delay_period
 
 PAIR = {
     "arm.g_m_s2": 0.0,

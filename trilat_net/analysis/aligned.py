@@ -374,7 +374,7 @@ def _fill_tick_grid(
     )
 
 
-class PeerMotion(NamedTuple):
+class _PeerMotion(NamedTuple):
     """Motion of another site (a peer) at K times, computed from its records.
 
     Joint by joint, the motion has n coordinates, in rad. In task space it has the m coordinates
@@ -414,7 +414,7 @@ class PeerTrajectory:
         running_sums = np.cumsum(steps, axis=0)
         self._squares: Array = np.vstack([start, running_sums])
 
-    def evaluate(self, t_s: Array) -> PeerMotion:
+    def evaluate(self, t_s: Array) -> _PeerMotion:
         """Returns the site's motion at some times. At its ticks this equals its records.
 
         Between two records, q is the cubic polynomial that has the recorded angles and
@@ -466,7 +466,7 @@ class PeerTrajectory:
         is_before = position < 0.0
         qd[is_before] = 0.0
         squares[is_before] = 0.0
-        return PeerMotion(q, qd, squares, known)
+        return _PeerMotion(q, qd, squares, known)
 
 
 class DelayedPeer(NamedTuple):
@@ -483,9 +483,9 @@ class DelayedPeer(NamedTuple):
             first sample.
     """
 
-    now: PeerMotion
-    delayed: PeerMotion
-    delayed_end: PeerMotion
+    now: _PeerMotion
+    delayed: _PeerMotion
+    delayed_end: _PeerMotion
     stamp_s: Array
 
     @property

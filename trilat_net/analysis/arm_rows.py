@@ -1039,7 +1039,7 @@ DEPENDENT_SHARE = 1e-9
 """Largest independent share of a column that counts as dependent on the columns before it."""
 
 
-class BaseParameters(NamedTuple):
+class _BaseParameters(NamedTuple):
     """Base parameters of an arm: the combinations of its parameters that torques determine.
 
     No measurement of torque and motion can determine every dynamic parameter theta of a chain
@@ -1093,7 +1093,7 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParameters:
+def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
     """Returns the base parameters of a chain by a QR decomposition (Gautier 1991).
 
     Args:
@@ -1127,10 +1127,10 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
     combination = np.zeros((base_count, len(learnt)))
     combination[:, indices] = np.where(contributes, factors, 0.0)
     combination[:, kept_indices] = np.eye(base_count)
-    return BaseParameters(kept_indices, combination)
+    return _BaseParameters(kept_indices, combination)
 
 
-def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParameters:
+def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParameters:
     """Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
 
     Torques do not determine every parameter of a chain by itself, but only some linear
@@ -1146,7 +1146,7 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParamet
         return _find_chain_base(arm.chain, tuple(learnt.tolist()))
     kept = np.flatnonzero(learnt)
     combination = np.eye(len(learnt))[kept]
-    return BaseParameters(kept, combination)
+    return _BaseParameters(kept, combination)
 
 
 def find_pseudo_inertias(theta: Array) -> Array:

@@ -179,16 +179,36 @@ def find_program(log: Log) -> str:
         Name of the user. Empty if no program moved an arm.
     """
     users = find_users(log.scenario)[1]
-    with_policy = []
-    with_program = []
-    for user in users:
-        begin = f"{user}: {POLICY} {TAKEN} "
-        if any(event.kind == "hand" and event.text.startswith(begin) for event in log.events):
-            with_policy.append(user)
-        hands = log.scenario.sites[user].hands
-        if any(isinstance(hand, ProgramHand) for hand in hands):
-            with_program.append(user)
+    with_policy = [user for user in users if _is_held_by_policy(log, user)]
+    with_program = [user for user in users if has_program_hand(log.scenario, user)]
     return ["", *with_policy, *with_program][-1]
+
+
+def list_program_sites(log: Log) -> list[str]:
+    """Lists the sites whose arms a program moved in a run, in scenario order.
+
+    The program is a hand of kind "own", or a policy that held the arm through the LeRobot
+    plugin or in an environment. It reacts to the motion of the arms, unlike a script.
+
+    Args:
+        log: Log of the run.
+    """
+    return [
+        site
+        for site in log.scenario.sites
+        if has_program_hand(log.scenario, site) or _is_held_by_policy(log, site)
+    ]
+
+
+def has_program_hand(scenario: Scenario, site: str) -> bool:
+    """Returns True if a site of a scenario has a hand of kind "own", a program of the user."""
+    return any(isinstance(hand, ProgramHand) for hand in scenario.sites[site].hands)
+
+
+def _is_held_by_policy(log: Log, site: str) -> bool:
+    """Returns True if the events of a log say that a policy took hold of the arm of a site."""
+    begin = f"{site}: {POLICY} {TAKEN} "
+    return any(event.kind == "hand" and event.text.startswith(begin) for event in log.events)
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
@@ -415,7 +435,7 @@ KD_SHAPE_TOLERANCE = 1e-9
 """Largest relative difference of two gains that count as equal."""
 
 
-class LyapunovWeights(NamedTuple):
+class _LyapunovWeights(NamedTuple):
     """Weights beta of the N sites in the energy function V of the stability proof.
 
     With these weights the energies that sites transfer to each other cancel in V. They follow
@@ -514,7 +534,7 @@ def find_kd_scales(Kd: Array) -> Array | None:
     return scales
 
 
-def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
+def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     """Computes the weight of each site in the energy function of the stability proof.
 
     A site is the process that runs one arm. Its weight is beta_i = pi_i / c_i, where pi is the
@@ -532,7 +552,7 @@ def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
     beta = pi if scales is None else pi / scales
     sites = len(beta)
     factor = sites / beta.sum()
-    return LyapunovWeights(
+    return _LyapunovWeights(
         beta=beta * factor,
         groups=find_closed_groups(alpha),
         scales=scales,

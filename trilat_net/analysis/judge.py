@@ -20,13 +20,11 @@ from ..execution.virtual import simulate_scenario
 from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..scenario import Scenario
-from ..scenario.describe import (
-    describe_law_conditions,
-    find_energy_laws,
-    list_law_proofs,
-)
+from ..scenario.describe import describe_law_conditions, list_law_situations
+from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import explain_no_functional
 from .certificate.stability_certificate import Certificate, certify
+from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability, classify_run_end
 from .run_remarks import list_remarks
 from .stability_decision import (
@@ -39,6 +37,31 @@ from .stability_decision import (
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from .theory.operating_point import has_lasting_delays
 from .twins.twin_growth import TwinGrowth, measure_twins, measure_virtual_twins
+
+
+def list_law_proofs(scenario: Scenario) -> list[str]:
+    """Lists the stability conditions of control laws that prove that all motions die away.
+
+    They are evaluated for the delays and dominance factors (the weights with which arms follow
+    each other) at the end of the scenario.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        A phrase per condition. Empty unless the condition of every site holds and proves it.
+    """
+    if any(change.dominance for change in scenario.timeline):
+        return []
+    links = {name: find_final_link(scenario, name) for name in scenario.links}
+    final = msgspec.structs.replace(scenario, links=links, timeline=())
+    proofs = []
+    for _, law, situation in list_law_situations(final):
+        condition = law.condition(situation)
+        if condition is None or not condition.proves_decay:
+            return []
+        proofs.append(f"the condition of {law.tag}: {condition.text}")
+    return list(dict.fromkeys(proofs))
 
 
 def certify_run(
@@ -87,7 +110,7 @@ The records of so many ticks need half a gigabyte of memory.
 """
 
 
-class VirtualJudgement(NamedTuple):
+class _VirtualJudgement(NamedTuple):
     """Judgement of a simulated run without a log.
 
     Attributes:
@@ -105,7 +128,7 @@ class VirtualJudgement(NamedTuple):
 
 def judge_virtual_run(
     scenario: Scenario, run: FusedRun, end: RunEnd | None = None
-) -> VirtualJudgement:
+) -> _VirtualJudgement:
     """Judges a simulated run as its certificate would, without a log.
 
     Twins, one for every joint, are executed only if they may change the decision. The run is
@@ -147,7 +170,7 @@ def judge_virtual_run(
         )
         decision = certificate.decision
     assert findings.roots is not None
-    return VirtualJudgement(end, findings.roots, twins, decision)
+    return _VirtualJudgement(end, findings.roots, twins, decision)
 
 
 def _has_energies(scenario: Scenario) -> bool:

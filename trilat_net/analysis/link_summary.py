@@ -36,7 +36,7 @@ from .aligned import Bools
 from .timeline import StatedModel, list_changes, list_stated_models
 
 
-class PredictedDelivery(NamedTuple):
+class _PredictedDelivery(NamedTuple):
     """Fate of the first M samples of a link, as the delay model of the link predicts it.
 
     A sample is the state that a site publishes in one tick. The delay model of the scenario
@@ -97,7 +97,7 @@ def predict_delivery(
     peer: str,
     site: str,
     count: int,
-) -> PredictedDelivery:
+) -> _PredictedDelivery:
     """Computes when a site may use each of the first samples that another site sent.
 
     A site is the process that runs one arm, and a sample is the state that it sends in every
@@ -137,7 +137,7 @@ def predict_delivery(
 
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
     model_index = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
-    return PredictedDelivery(
+    return _PredictedDelivery(
         stamp_ns=stamp_ns,
         due_ns=due_ns,
         drawn_ns=drawn_ns,
@@ -146,7 +146,7 @@ def predict_delivery(
     )
 
 
-class Arrivals(NamedTuple):
+class _Arrivals(NamedTuple):
     """Samples that arrived at a site over a link, in the order in which they arrived.
 
     Attributes:
@@ -163,16 +163,16 @@ class Arrivals(NamedTuple):
     refused: int
 
     @property
-    def first(self) -> "Arrivals":
+    def first(self) -> "_Arrivals":
         """These arrivals without duplicates: only the first arrival of each sample is kept.
 
         They are ordered by the number of the sample, which the sender counts from 0.
         """
         sample, rows = np.unique(self.sample, return_index=True)
-        return Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
+        return _Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
 
 
-def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
+def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     """Reads from a log which samples of other sites arrived at a site, and when.
 
     A site is the process that runs one arm, and a sample is the state that it sends in every
@@ -202,7 +202,7 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
         latest_sample = ((latest_ns + 1) * peer_rate_hz - 1) // NS_PER_S
         is_in_range = (sample >= 0) & (sample <= latest_sample)
         is_valid = is_in_range & (sample < log.scenario.ticks(peer))
-        arrivals[peer] = Arrivals(
+        arrivals[peer] = _Arrivals(
             tick=tick[is_valid],
             sample=sample[is_valid],
             delay_us=delay_us[is_valid],
@@ -211,7 +211,7 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
     return arrivals
 
 
-def count_sent(log: Log, peer: str, newest: int) -> int:
+def _count_sent(log: Log, peer: str, newest: int) -> int:
     """Returns the number of samples that a peer has sent, as far as the log shows.
 
     A sample is the state that a site publishes in one tick of its control loop.
@@ -234,7 +234,7 @@ def _mark_judged_samples(
     log: Log,
     site: str,
     stamp_ns: Ints,
-    arrivals: Arrivals,
+    arrivals: _Arrivals,
 ) -> Bools:
     """Finds the samples of which the log shows whether they arrived. They are "judged".
 
@@ -305,7 +305,7 @@ class ValueStatistics(NamedTuple):
     max: float
 
 
-class AgeHistogram(NamedTuple):
+class _AgeHistogram(NamedTuple):
     """Number of ticks by the age of the sample in use, in bins of equal width.
 
     Attributes:
@@ -454,7 +454,7 @@ class LinkSummary(NamedTuple):
     stated: list[StatedModel]
     drawn_ms: ValueStatistics | None
     age_ms: ValueStatistics | None
-    ages: AgeHistogram | None
+    ages: _AgeHistogram | None
     first_use_s: float | None
     ticks_without_new: float | None
     silence_ms: float | None
@@ -498,7 +498,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
         LogError: A record names a change that is not valid.
     """
     changed = list_changes(log)
-    arrivals_by_site = {site: read_arrivals(log, site) for site in log.sites}
+    arrivals_by_site = {site: _read_arrivals(log, site) for site in log.sites}
     sent = {}
     for peer in log.sites:
         newest = max(
@@ -506,7 +506,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
             for arrivals in arrivals_by_site.values()
             if peer in arrivals
         )
-        sent[peer] = count_sent(log, peer, newest)
+        sent[peer] = _count_sent(log, peer, newest)
 
     return [
         _summarise_link(
@@ -566,7 +566,7 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
     )
 
 
-def bin_ages(age_ns: Ints) -> AgeHistogram | None:
+def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
     """Returns a histogram of ages in at most `MOST_AGE_BINS` bins.
 
     The width of a bin is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
@@ -589,7 +589,7 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
     )
     first_bin = youngest_ns // width_ns
     ticks = np.bincount(age_ns // width_ns - first_bin).tolist()
-    return AgeHistogram(first_bin * width_ns / 1e6, width_ns / 1e6, ticks)
+    return _AgeHistogram(first_bin * width_ns / 1e6, width_ns / 1e6, ticks)
 
 
 def _summarise_link(
@@ -598,7 +598,7 @@ def _summarise_link(
     peer: str,
     site: str,
     sent: int,
-    arrivals: Arrivals,
+    arrivals: _Arrivals,
 ) -> LinkSummary:
     """Returns the summary of the link from a peer to a site.
 
@@ -673,8 +673,8 @@ def _summarise_link(
 def _count_samples(
     part: SiteLog,
     used: Ints,
-    delivery: PredictedDelivery,
-    arrivals: Arrivals,
+    delivery: _PredictedDelivery,
+    arrivals: _Arrivals,
     judged: int,
 ) -> SampleCounts:
     """Counts the samples of a link by what happened to them, see `SampleCounts`.
@@ -710,3 +710,43 @@ def _count_samples(
         copies=delivery.copies,
         refused=arrivals.refused,
     )
+
+
+class DelayDistribution(NamedTuple):
+    """Delays and ages of the samples on one link.
+
+    Attributes:
+        peer: Name of the sender.
+        site: Name of the receiver.
+        delay_ms: Delays of the samples, shape (S,). They follow from the link's model if the
+            scenario has one, and were measured otherwise.
+        age_ms: Age of the sample in use at each tick of the receiver, shape (K,).
+    """
+
+    peer: str
+    site: str
+    delay_ms: Array
+    age_ms: Array
+
+
+def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
+    """Collects the delays and ages of the samples on every link of a run.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        An entry per link, ordered by receiver and then by sender.
+    """
+    distributions = []
+    for site in log.sites:
+        for peer, arrivals in _read_arrivals(log, site).items():
+            newest = int(arrivals.sample.max(initial=-1))
+            sent_count = _count_sent(log, peer, newest)
+            delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
+            # A link without a model has only measured delays, and only in a live session.
+            if not len(delay_ms) and log.driver == "live":
+                delay_ms = arrivals.delay_us / 1e3
+            age_ms = sample_ages_ns(log, peer, site) / 1e6
+            distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
+    return distributions

@@ -5,7 +5,8 @@ a run was stable, but they show where the run was at the limits of its arms or o
 
 - a motor was at its torque limit, so that the control law did not act in full;
 - an operator or a wall pushed with a large share of the torque limit;
-- ticks (periods of the control loop) began late by a whole period or more.
+- ticks (periods of the control loop) began late by a whole period or more;
+- a program of the user moved an arm, or failed while it did.
 
 Invariant:
     - A remark states a number for each site that it names.
@@ -16,6 +17,7 @@ import numpy as np
 
 from ..errors import count_nouns, join_words
 from ..log.log_reader import Log
+from .dominance_history import list_program_sites
 from .site_signals import external_torques
 
 LARGE_PUSH_SHARE = 0.5
@@ -36,8 +38,22 @@ def list_remarks(log: Log) -> tuple[str, ...]:
         _describe_torque_limits(log),
         _describe_large_pushes(log),
         _describe_late_ticks(log),
+        _describe_programs(log),
+        *log.failed_hands,
     )
     return tuple(remark for remark in candidates if remark)
+
+
+def _describe_programs(log: Log) -> str:
+    """Returns that the judgement leaves out how programs react. Empty if no program acted."""
+    sites = list_program_sites(log)
+    if not sites:
+        return ""
+    subject = "a program moves" if len(sites) == 1 else "programs move"
+    return (
+        f"{subject} {join_words(sites)}; recorded actions were repeated, so the roots and the "
+        "pushes leave out how the arms and the program act on each other"
+    )
 
 
 def _describe_torque_limits(log: Log) -> str:

@@ -1,10 +1,8 @@
-"""Defines the signals of an arm, its settling time, and how signals are reduced for plots.
+"""Defines the signals of an arm, and its settling time.
 
 A signal is an array with a row for each record (the result of one tick of the arm's control
-loop), such as the errors of the joints. For plots, the rows are reduced: each bucket of records
-keeps the minimum and the maximum of each column, so that a spike of a single tick at 1 kHz
-stays visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no
-line is drawn across it.
+loop), such as the errors of the joints. `presentation.plot_signals` has the signals that only
+figures show, and reduces signals for plots.
 
 Invariant:
     - Each signal has one definition, for figures, pages, summaries and metrics.
@@ -44,21 +42,6 @@ P is 5 for the planar arm and 10 n for a chain.
 """
 
 
-def reference_angles(part: SiteLog) -> Array:
-    """Returns the angles that the joints of a site should reach, in rad.
-
-    The reference q_des, Eq. (6), is the weighted mean of the peers' delayed angles. In task
-    space the joints have no reference, and the angles q themselves are returned.
-
-    Args:
-        part: Log of the site.
-
-    Returns:
-        Angles, shape (K, n).
-    """
-    return part.q if part.layout.task else part.q_des
-
-
 def follows_in_task_space(log: Log) -> bool:
     """Returns True if the sites follow each other with their end effectors.
 
@@ -71,87 +54,9 @@ def follows_in_task_space(log: Log) -> bool:
     return any(arm.shares_pose for arm in arms)
 
 
-def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the derivative of a site's error: its velocity minus the followed velocity.
-
-    A site is the process that runs one arm.
-
-    Args:
-        part: The site's part of the log, with K records.
-
-    Returns:
-        Velocity errors of the n joints, shape (K, n), in rad/s. If the arm follows with its end
-        effector, they are the errors of its m coordinates, shape (K, m).
-    """
-    if part.layout.task:
-        # in task space the column qd_des holds xd_des
-        velocity_error = part.xd - part.qd_des
-        followed_axes = np.array(part.axes)
-        rates: Array = velocity_error * followed_axes
-        return rates
-    return part.qd - part.qd_des
-
-
-def shared_unit(log: Log) -> str:
-    """Returns the unit of the coordinates that the sites share, and of their errors.
-
-    It is "rad" for joint angles, "m" for positions and "m, rad" for poses of end effectors.
-
-    Args:
-        log: The log of the run.
-    """
-    first_site = log.sites[0]
-    space = log.scenario.sites[first_site].task.space
-    if space == "joints":
-        return "rad"
-    return "m" if space == "position" else "m, rad"
-
-
 def external_torques(part: SiteLog) -> Array:
     """Returns the torque of operator and environment on the arm, shape (K, n), in N m."""
     return 0.0 - part.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
-
-
-def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the age of each peer's sample in use, in ms.
-
-    Args:
-        log: The log of the run.
-        site: Name of the site.
-
-    Returns:
-        Ages, shape (K, N - 1), with a column for each peer. NaN before a peer's first sample.
-    """
-    part = log[site]
-    columns = []
-    for peer in part.peers:
-        rate_hz = log.scenario.sites[peer].rate_hz
-        columns.append(part.age_s(peer, rate_hz) * 1e3)
-    shape = (len(part.peers), len(part))
-    return np.array(columns).reshape(shape).T
-
-
-def sites_with_operator(log: Log) -> list[str]:
-    """Lists the sites at which somebody may act on the arm.
-
-    They have an operator in the scenario, or recorded external torques.
-
-    Args:
-        log: The log of the run.
-    """
-    sites = []
-    for site in log.sites:
-        has_hands = bool(log.scenario.sites[site].hands)
-        if has_hands or np.any(log[site].tau_x):
-            sites.append(site)
-    return sites
-
-
-def largest_magnitude(values: Array) -> Array:
-    """Returns the largest absolute value of each row, shape (K,)."""
-    magnitudes = np.abs(values)
-    largest: Array = magnitudes.max(axis=1, initial=0.0)
-    return largest
 
 
 class JointError(NamedTuple):
@@ -220,6 +125,13 @@ def find_last_error(log: Log) -> JointError | None:
     errors = [find_error_of_last_second(log[site]) for site in log.sites]
     known = [error for error in errors if error is not None]
     return max(known, key=lambda error: error.value, default=None)
+
+
+def largest_magnitude(values: Array) -> Array:
+    """Returns the largest absolute value of each row, shape (K,)."""
+    magnitudes = np.abs(values)
+    largest: Array = magnitudes.max(axis=1, initial=0.0)
+    return largest
 
 
 def largest_remaining_error(part: SiteLog) -> Array:
@@ -293,105 +205,3 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
     q = joint_angles(part)[rows]
     twin_q = joint_angles(twin_part)[twin_rows]
     return common_tick, part.t_s[rows], q - twin_q
-
-
-class DecimatedTrace(NamedTuple):
-    """Signals reduced to few points, so that they can be drawn quickly.
-
-    A gap in the records that would be visible is marked by a row of NaN, which interrupts the
-    curve.
-
-    Attributes:
-        tick: Ticks of the P points, shape (P,).
-        t_s: Times of the points, shape (P,), in s.
-        values: Values of the C signals, shape (P, C).
-    """
-
-    tick: Ints
-    t_s: Array
-    values: Array
-
-
-def extreme_rows(values: Array, buckets: int) -> Ints:
-    """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
-
-    The rows are divided into intervals with equal numbers of rows (buckets). In each bucket the
-    rows with the largest and the smallest value of each column are kept. The first and the last
-    row are kept as well. NaN is never an extreme. A bucket in which a column is NaN throughout
-    keeps its first row.
-
-    Args:
-        values: The signals in columns, shape (K, C).
-        buckets: Number of buckets.
-
-    Returns:
-        Indices of the rows.
-    """
-    rows, columns = values.shape
-    if rows <= 2 * buckets or not columns:
-        return np.arange(rows)
-
-    # The negated floor division rounds up.
-    size = -(-rows // buckets)
-    filled_buckets = -(-rows // size)
-    # the last bucket is filled up with its last row, which changes no extreme
-    filled_rows = np.arange(filled_buckets * size)
-    valid_rows = np.minimum(filled_rows, rows - 1)
-    index = valid_rows.reshape(-1, size)
-    bucket = np.arange(filled_buckets)
-
-    ends = np.array([0, rows - 1])
-    keep = [ends]
-    for column in range(columns):
-        block = values[index, column]
-        missing = np.isnan(block)
-        above_missing = np.where(missing, np.inf, block)
-        below_missing = np.where(missing, -np.inf, block)
-        lowest = above_missing.argmin(1)
-        highest = below_missing.argmax(1)
-        keep.append(index[bucket, lowest])
-        keep.append(index[bucket, highest])
-    return np.unique(np.concatenate(keep))
-
-
-def decimate(
-    tick: Ints,
-    t_s: Array,
-    values: Array,
-    buckets: int,
-) -> DecimatedTrace:
-    """Reduces signals to the points that a plot needs, so that no peak gets lost.
-
-    The time is divided into buckets, of which each keeps at most 2 C + 3 points for C columns,
-    among them the extremes of each column. One bucket per pixel of a plot is enough.
-
-    Args:
-        tick: Ascending ticks, shape (K,).
-        t_s: Their nominal times, shape (K,), in s.
-        values: The signals in columns, shape (K, C).
-        buckets: Number of buckets.
-    """
-    if not len(tick):
-        return DecimatedTrace(tick, t_s, values)
-
-    # narrower gaps are narrower than a pixel, and there may be thousands of them
-    ticks = tick[-1] - tick[0]
-    bucket_ticks = max(1.0, ticks / buckets)
-    before_gap = np.flatnonzero(np.diff(tick) > bucket_ticks)
-    after_gap = before_gap + 1
-    beside_gaps = np.concatenate([before_gap, after_gap])
-    keep = np.union1d(extreme_rows(values, buckets), beside_gaps)
-
-    # the row of NaN is one period after the last record before the gap
-    gap_ticks = tick[after_gap] - tick[before_gap]
-    gap_s = t_s[after_gap] - t_s[before_gap]
-    period_s = gap_s / gap_ticks
-    nan_position = np.searchsorted(keep, before_gap) + 1
-    nan_tick = tick[before_gap] + 1
-    nan_t_s = t_s[before_gap] + period_s
-    kept_values = values[keep]
-    return DecimatedTrace(
-        tick=np.insert(tick[keep], nan_position, nan_tick),
-        t_s=np.insert(t_s[keep], nan_position, nan_t_s),
-        values=np.insert(kept_values, nan_position, np.nan, axis=0),
-    )

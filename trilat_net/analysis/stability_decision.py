@@ -47,6 +47,10 @@ RATE_AGREEMENT_PER_S = 2e-4
 LEAST_BURSTS = 100.0
 """Number of bursts of lost samples from which on their mean effect decides how a run ends."""
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+_LONGEST_ADVISED_S = 1e4
+"""Length of the longest run that is advised, in s. The estimate of a longer one rests on a root
+so small that its value means little.
+"""
 _UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 
 
@@ -66,6 +70,10 @@ class LoopRoots(NamedTuple):
         text: The pose and its roots, or the reason why there are no roots.
         distance_rad: Largest difference between the last angle of a joint and its angle at the
             pose at rest to which the roots belong, in rad.
+        leaves_out: What the linearised loop leaves out, as a phrase, for example "how the
+            program at m2 reacts to the arms". Empty if it contains everything.
+        is_numerical: True if the code of a user's law was differentiated numerically. Such
+            roots can refute a run, but not prove it stable.
     """
 
     verdict: str
@@ -73,6 +81,8 @@ class LoopRoots(NamedTuple):
     exact: bool
     text: str
     distance_rad: float = 0.0
+    leaves_out: str = ""
+    is_numerical: bool = False
 
     @property
     def is_proof(self) -> bool:
@@ -80,11 +90,15 @@ class LoopRoots(NamedTuple):
         return self.exact and self.verdict == "stable"
 
     def describe_as_basis(self) -> str:
-        """Returns the roots as the basis of a decision, for example "exact roots"."""
+        """Returns on what a decision rests if these roots of the control loop decide it.
+
+        For example "exact roots, slowest -0.832 /s".
+        """
+        name = "roots by numerical derivatives" if self.is_numerical else "exact roots"
         if self.rate_per_s is None:
-            return "exact roots"
+            return name
         decisive = "fastest growing" if self.is_refutation else "slowest"
-        return f"exact roots, {decisive} {self.rate_per_s:+.3g} /s"
+        return f"{name}, {decisive} {self.rate_per_s:+.3g} /s"
 
     @property
     def is_refutation(self) -> bool:
@@ -182,7 +196,9 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
         return StabilityDecision(Stability.OPEN, "", reasons)
     needed_s = _estimate_needed_s(run)
     if run.all_proofs and needed_s is not None and needed_s > end.lasts_s:
-        reason = f"the run is too short to tell; a run of {needed_s:.3g} s would"
+        reason = "the run is too short to tell; try one of twice its length"
+        if needed_s <= _LONGEST_ADVISED_S:
+            reason = f"the run is too short to tell; a run of {needed_s:.3g} s would"
         return StabilityDecision(Stability.OPEN, "", (reason,), is_too_short=True)
     return StabilityDecision(Stability.OPEN, "", (_explain_open(run),))
 
@@ -346,6 +362,8 @@ def _describe_pushes(run: RunFindings) -> str:
         return text
     if not roots.verdict:
         return f"{text}; {roots.text}"
+    if roots.leaves_out:
+        return f"{text}; pushes and roots leave out {roots.leaves_out}"
     if not roots.exact:
         return f"{text}; its roots are not exact"
     return text

@@ -72,7 +72,7 @@ def list_effective_commands(log: Log) -> list[Change]:
     return effective
 
 
-class AppliedChange(NamedTuple):
+class _AppliedChange(NamedTuple):
     """A change that a site carried out, from the scenario or from a command during the run.
 
     Attributes:
@@ -107,7 +107,7 @@ class AppliedChange(NamedTuple):
         return f"{shares} within {change.ramp_s:g} s" if change.ramp_s else shares
 
 
-class ModeInterval(NamedTuple):
+class _ModeInterval(NamedTuple):
     """An interval of time in which a site did not follow its peers.
 
     Instead it held its position, braked, or returned to following.
@@ -141,7 +141,7 @@ class StatedModel(NamedTuple):
     link: LinkBase
 
 
-def list_changes(log: Log) -> list[AppliedChange]:
+def list_changes(log: Log) -> list[_AppliedChange]:
     """Lists all changes before the end of a run, in the order in which they took effect.
 
     The records also name ticks that a site had to skip. Such an entry is included only if the
@@ -154,7 +154,7 @@ def list_changes(log: Log) -> list[AppliedChange]:
         LogError: A record names a change that is not valid.
     """
     applied = [
-        AppliedChange(change, find_owner(change), None, describe_change(change))
+        _AppliedChange(change, find_owner(change), None, describe_change(change))
         for change in log.scenario.timeline
     ]
 
@@ -172,7 +172,7 @@ def list_changes(log: Log) -> list[AppliedChange]:
                     sentence = describe_change(change)
                 else:
                     sentence = describe_event(event.kind, event.text, event.command)
-                applied.append(AppliedChange(change, site, tick, sentence))
+                applied.append(_AppliedChange(change, site, tick, sentence))
     end_s = recorded_end_s(log)
     visible_entries = []
     for entry in applied:
@@ -185,7 +185,7 @@ def list_changes(log: Log) -> list[AppliedChange]:
 def list_stated_models(
     log: Log,
     link: str,
-    changed: Sequence[AppliedChange],
+    changed: Sequence[_AppliedChange],
 ) -> list[StatedModel]:
     """Lists the delay models of a link: the one at the start, and one after every change.
 
@@ -216,7 +216,7 @@ def recorded_end_s(log: Log) -> float:
     return max(ends_s, default=log.scenario.duration_s)
 
 
-def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
+def find_mode_intervals(part: SiteLog) -> list[_ModeInterval]:
     """Finds the times in which an arm did not follow the other arms, in order.
 
     In these times the site, the process that runs the arm, held its position, slowed down to a
@@ -238,12 +238,12 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
     for mode, records in groupby(modes):
         end = first + len(list(records))
         if not MODES[mode].follows:
-            intervals.append(ModeInterval(mode, times_s[first], times_s[end]))
+            intervals.append(_ModeInterval(mode, times_s[first], times_s[end]))
         first = end
     return intervals
 
 
-class RaisedAlarm(NamedTuple):
+class _RaisedAlarm(NamedTuple):
     """An interval in which a site raised an alarm: it held, was stopped, or had a fault.
 
     Alarms exist only at sites whose rule for silent peers (`on_stale` of the scenario) is
@@ -269,7 +269,7 @@ class RaisedAlarm(NamedTuple):
         return f"{self.site} {self.word} {self.from_s:.3f}-{self.to_s:.3f} s: {self.reason}"
 
 
-def list_alarms(log: Log) -> list[RaisedAlarm]:
+def list_alarms(log: Log) -> list[_RaisedAlarm]:
     """Lists the alarms of all sites, in the order of their start.
 
     If somebody ordered a site to stop, the reason of the alarm names this person.
@@ -303,5 +303,5 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
                 continue
             requester = requesters.get((site, state.tick), "")
             reason = f"ordered by {requester}" if requester else alarm.reason
-            raised.append(RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s))
+            raised.append(_RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s))
     return sorted(raised, key=lambda alarm: alarm.from_s)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from ..entry_points import find_viewer
 from ..errors import UsageError
 from ..execution.log_checks import LogCheckReport, run_log_checks
 from ..execution.virtual import SimulatedLog, simulate_scenario
@@ -67,7 +68,7 @@ def simulate(
         ScenarioError: The scenario or an override is not valid.
     """
     log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
-    log.warn_if_diverged()
+    log.warn_of_failures()
     return log
 
 
@@ -299,6 +300,7 @@ def view(
     save: str | Path | None = None,
     foxglove: bool = False,
     rviz: bool = False,
+    viewer: str | None = None,
 ) -> None:
     """Opens a log in the viewer Rerun; the command is `trilat log view`.
 
@@ -315,15 +317,22 @@ def view(
             as run.foxglove.json, instead of opening Rerun.
         rviz: True to write a configuration of RViz for the ROS 2 topics of the session beside
             the log, as run.rviz, instead of opening Rerun.
+        viewer: Name of a viewer that another package adds, which opens the log instead.
 
     Raises:
-        UsageError: Rerun is not installed, there is no display, or a file exists.
+        UsageError: Rerun is not installed, there is no display, a file exists, or there is no
+            such viewer.
         LogError: The log cannot be read.
     """
     from ..presentation.rerun_viewer import ViewerOptions, open_rerun
     from ..presentation.viewer_files import write_foxglove_layout, write_rviz_config
 
     paths = [Path(file) for file in files]
+    if viewer is not None:
+        if full or save is not None or foxglove or rviz:
+            raise UsageError("viewer cannot be combined with full, save, foxglove or rviz")
+        find_viewer(viewer)(paths)
+        return
     if foxglove or rviz:
         if full or save is not None:
             raise UsageError("foxglove and rviz cannot be combined with full or save")

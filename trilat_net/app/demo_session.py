@@ -34,10 +34,11 @@ from typing import Any
 from rich.console import Console
 from setproctitle import setproctitle
 
-from sites.machine_load import describe_load, measure_busy_share
+from sites.machine_load import check_machine_load
 from sites.site_parts import warm_up
 from trilat_net.core.step.jit import compiling_notice, is_core_cached
 from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import (
     create_file,
@@ -51,9 +52,9 @@ from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.operators.program_hand import find_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 from trilat_net.signals import Interrupt
@@ -306,8 +307,12 @@ def run_demo(
 
     Raises:
         ScenarioError: The scenario lacks the limits of an external arm.
+        UsageError: A user is a program of its own, and the package trilat-people is missing.
     """
     check_outside_arms(scenario)
+    if any(_needs_hand_process(scenario, name) for name in scenario.names):
+        # A missing package is reported now, and not by a process in the middle of the start.
+        load_entry(COMMANDS, "hand", "trilat hand")
     result = SessionResult(folder / "run.mcap")
     session = scenario.name
     clock = SystemClock()
@@ -317,7 +322,7 @@ def run_demo(
         ExitStack() as reserved,
     ):
         compile_core(scenario, display.say, interrupt)
-        load_warning = describe_load(measure_busy_share(clock))
+        load_warning = check_machine_load(clock)
         if load_warning:
             display.say(f"warning: {load_warning}")
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
@@ -431,8 +436,7 @@ def _start(
         arguments += [*chain(*connect[:index]), "--needs-recorder", *patience]
         processes.append(starter.start(name, arguments))
     for index, name in enumerate(scenario.names):
-        own_hand = find_own_hand(scenario, name)
-        if own_hand is not None and own_hand.has_separate_process:
+        if _needs_hand_process(scenario, name):
             arguments = ["hand", name, *common, *connect[index], *patience]
             processes.append(starter.start(f"hand-{name}", arguments))
 
@@ -440,6 +444,17 @@ def _start(
     record += [*patience, "--force"]
     start_recorder = partial(starter.start, topics.RECORDER, record)
     return starter, processes, start_recorder
+
+
+def _needs_hand_process(scenario: Scenario, site: str) -> bool:
+    """Returns True if the user of a site is a program that runs in a process of its own.
+
+    Args:
+        scenario: The scenario.
+        site: Name of the site.
+    """
+    own_hand = find_own_hand(scenario, site)
+    return own_hand is not None and own_hand.has_separate_process
 
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
@@ -730,5 +745,5 @@ def run(
         kept = f"; {result.log} holds what there was" if result.log.exists() else ""
         raise RunFailed("; ".join(problems) + kept)
     log = open_log(result.log)
-    log.warn_if_diverged()
+    log.warn_of_failures()
     return log

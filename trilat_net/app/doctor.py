@@ -26,13 +26,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from sites.machine_load import describe_load, measure_busy_share
-from sites.site_loop import PeerInbox, StateBlock, run_loop
+from sites.loop_rehearsal import rehearse_loop
+from sites.machine_load import check_machine_load
 from sites.site_parts import warm_up
 from trilat_net import workers
 from trilat_net.core.step.jit import is_core_cached
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import NS_PER_S, Arrival, TickInput, TickRecord
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
 from trilat_net.files import read_foreign_permissions
 from trilat_net.net.clock import Clock, SystemClock
@@ -52,10 +50,9 @@ from trilat_net.net.member_keys import (
     MemberKeys,
     read_member_keys,
 )
-from trilat_net.net.timing import LoopStats, SiteTiming
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
-from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario import load_scenario
 
 from .session_ping import ping_session
 
@@ -496,110 +493,6 @@ def examine_system() -> DoctorFinding:
     return DoctorFinding("system", "warn", text)
 
 
-class Rehearsal(LoopStats):
-    """Runs the control loop of a single site without a network, to measure how late ticks are.
-
-    The loop does the same work as in a session, except that no messages are exchanged. This
-    object takes the place of two objects of the loop: of its statistics, so that the lateness
-    of each tick can be stored, and of the `LoopSite`, whose methods do nothing here.
-
-    A tick is one period of the control loop. It is late if it begins after the time at which it
-    was due.
-
-    Args:
-        scenario: The scenario, which describes the arms, their links and the run.
-        name: Name of the site.
-    """
-
-    def __init__(self, scenario: Scenario, name: str) -> None:
-        self._site = Site(scenario.setup(name))
-        self._ticks = scenario.ticks(name)
-        super().__init__(self._site, 1)
-        self._late_us: list[int] = []
-
-    def run(self, clock: Clock) -> list[int]:
-        """Executes all ticks (periods of the control loop) of the scenario in real time.
-
-        The loop runs without other sites: there are no links to receive samples from, and the
-        records are not sent anywhere.
-
-        Args:
-            clock: Clock of this process.
-
-        Returns:
-            The lateness of each tick, the time from its due time to its beginning, in us.
-        """
-        boot = 1  # identifies the start of the process, which matters only in a network
-        inbox_without_peers = PeerInbox(
-            links=(), rings=(), boots=(), monitors=(), dropped=self.dropped
-        )
-        # The first tick is due a tenth of a second from now.
-        first_tick_ns = clock.monotonic_ns() + NS_PER_S // 10
-        timing = SiteTiming(first_tick_ns, self._site.rate_hz, peers=(), leader="")
-        discarded_records = StateBlock(self._site, boot, send=lambda _: None)
-
-        run_loop(
-            site=self._site,
-            boot=boot,
-            ticks=self._ticks,
-            clock=clock,
-            inbox=inbox_without_peers,
-            timing=timing,
-            stats=self,
-            states=discarded_records,
-            io=self,
-        )
-        return self._late_us
-
-    def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Adds one tick to the statistics, and stores its lateness.
-
-        The loop calls the method in place of `LoopStats.count_tick`.
-
-        Args:
-            late_us: Time by which the tick began late, in us.
-            busy_us: Computing time of the previous tick, in us.
-            skipped: Number of ticks (periods of the control loop) that were skipped before this
-                tick.
-        """
-        super().count_tick(late_us, busy_us, skipped)
-        self._late_us.append(late_us)
-
-    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Computes one tick of the site without samples from other sites, to test its timing.
-
-        A tick is one period of the control loop. The loop calls this method in place of
-        `LoopSite.step`.
-
-        Args:
-            k: Number of the tick.
-            arrivals: Samples (states of other sites) that have arrived. Always empty in this
-                test.
-
-        Returns:
-            The record of the tick: what the site measured and computed.
-        """
-        return self._site.step(TickInput(k, arrivals))
-
-    def run_housekeeping(self, *_: object) -> bool:
-        """Does nothing, because this test of the control loop has no network.
-
-        The loop calls this method after a tick, in the place where a site of a session sends
-        and receives messages.
-
-        Returns:
-            False, so that the loop continues.
-        """
-        return False
-
-    # The other methods of `LoopSite`.
-    publish_sample = run_housekeeping
-    publish_link = run_housekeeping
-    report_tick = run_housekeeping
-    should_stop = run_housekeeping
-    use_slack = run_housekeeping
-
-
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
     """Runs a site at decreasing tick rates until its ticks are punctual.
 
@@ -618,7 +511,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
                 break
         scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
         warm_up(scenario, "s", clock)
-        late_us = sorted(Rehearsal(scenario, "s").run(clock))
+        late_us = sorted(rehearse_loop(scenario, "s", clock))
         quantile_us = late_us[int(MIN_PUNCTUAL_SHARE * len(late_us))]
         results.append((rate_hz, quantile_us, late_us[-1]))
     return results
@@ -637,8 +530,9 @@ def is_held(rate_hz: int, late_us: int) -> bool:
 
 
 _RATES_CODE = (
-    "import json; from sites import doctor, realtime; realtime.prepare(None); "
-    "print(json.dumps(doctor.rehearse_rates(doctor.SystemClock())))"
+    f"import json; from {__name__} import SystemClock, rehearse_rates; "
+    "from sites.realtime import prepare; prepare(None); "
+    "print(json.dumps(rehearse_rates(SystemClock())))"
 )
 """Program that requests the real-time settings of a site, and prints the result of the trials.
 """
@@ -706,7 +600,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     cores = workers.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     text = f"{count_nouns(cores, 'processor')}, on which {load:.1f} programs want to run"
-    warning = describe_load(measure_busy_share(SystemClock()))
+    warning = check_machine_load(SystemClock())
     if warning:
         text = f"{text}; {warning}"
     is_short = cores < 2 or load >= cores or bool(warning)

@@ -314,7 +314,7 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
             child.wait()
 
 
-class ScenarioNeeds(NamedTuple):
+class _ScenarioNeeds(NamedTuple):
     """Requirements of a scenario on the network.
 
     Attributes:
@@ -341,7 +341,7 @@ class ScenarioNeeds(NamedTuple):
     words: str
 
 
-def find_needs(scenario: Scenario) -> ScenarioNeeds:
+def find_needs(scenario: Scenario) -> _ScenarioNeeds:
     """Computes the delay, the message size and the rate that a scenario needs of the network.
 
     The delays for which the control loop is stable come from its linear analysis, which takes
@@ -376,7 +376,7 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
         ]
         if not overrides:
             in_use_ms = 1e3 * float(loop.conditions.age_s.max())
-    return ScenarioNeeds(
+    return _ScenarioNeeds(
         sample_bytes=_measure_sample(scenario),
         rate_hz=max(rates_hz),
         playout_ms=min((link.playout_ms for link in links), default=0.0),
@@ -410,7 +410,7 @@ def _measure_sample(scenario: Scenario) -> int:
     return len(msgspec.msgpack.encode(sample))
 
 
-def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
+def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
     """Judges whether a network is good enough for a scenario.
 
     A sample is the state that a site publishes in each tick, a period of its control loop. The
@@ -476,7 +476,7 @@ class NetworkBenchmark(Result):
 
     scenario: str
     duration_s: float
-    needs: ScenarioNeeds
+    needs: _ScenarioNeeds
     rows: list[dict[str, Any]]
     judged: list[dict[str, Any]]
     connect: tuple[str, ...] = ()
@@ -580,7 +580,7 @@ def ping_benchmark(
 def _measure_endpoint(
     endpoint: str,
     keys: MemberKeys | None,
-    needs: ScenarioNeeds,
+    needs: _ScenarioNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
     """Measures the transport of one endpoint, with all message sizes and rates.

@@ -2,7 +2,7 @@
 
 from recorder.record_process import ReadScenario, RecordedScenario
 
-from ..log.ros2.viz_channels import offer_views
+from ..hooks import find_hook
 from ..scenario import parse_embedded
 
 
@@ -11,12 +11,13 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
 
     Args:
         views_hz: Rate of the messages for viewers in the log, in Hz, see
-            `log.ros2.viz_channels`. With 0, the log contains none.
+            `log.view_rates`. With 0, the log contains none.
     """
 
     def read_scenario(text: str, source: str) -> RecordedScenario:
         """Reads the text of a scenario that another process has sent."""
         scenario = parse_embedded(text, source)
-        return RecordedScenario(scenario, offer_views(scenario, views_hz))
+        make_views = find_hook("offer the views of a log")(scenario, views_hz)
+        return RecordedScenario(scenario, make_views)
 
     return read_scenario

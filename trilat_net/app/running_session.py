@@ -23,8 +23,7 @@ from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-from sites.device_hand import DeviceHand
-from sites.devices import Device
+from trilat_net.entry_points import HOOKS, load_entry
 from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.net.arm_client import Hand
@@ -46,6 +45,7 @@ from trilat_net.scenario import Scenario, embedded_names_reader, find_site, pars
 from trilat_net.scenario.run_changes import parse_core_change
 from trilat_net.scenario.sample_uses import PictureDelay
 
+from .input_device import Device
 from .session_ping import PingReport, ping_session
 
 GATHERING_NS = 500_000_000
@@ -270,8 +270,10 @@ class RunningSession:
 
         Raises:
             SessionError: The session does not exist, or does not begin in time.
-            UsageError: The scenario does not allow an input device to move that arm.
+            UsageError: The scenario does not allow an input device to move that arm, or the
+                package trilat-people is not installed.
         """
+        make_device_hand = load_entry(HOOKS, "device-hand", "RunningSession.lead")
         with (
             self.reach_site(site, timeout_s) as (bus, scenario),
             open_hand(
@@ -290,7 +292,7 @@ class RunningSession:
                     "a device can lead only an end effector: "
                     f"the hand of {site} must have the mode 'tip'"
                 )
-            device_hand = DeviceHand(
+            device_hand = make_device_hand(
                 hand=hand,
                 device=device,
                 settings=live.device,

@@ -48,11 +48,11 @@ from ..core.step.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange,
 from ..core.step.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError, count_nouns
 from ..log.log_reader import Log
+from ..own_code.code_consent import find_user_laws
 from ..scenario import Scenario
-from ..scenario.code_consent import find_user_laws
 from ..scenario.operators.kernel_operators import Wall
 from ..scenario.operators.program_hand import make_hand_players
-from ..scenario.own_plant import PlantPlayer
+from ..scenario.plant_player import PlantPlayer
 from ..scenario.validate import refuse_external_arms
 
 

@@ -32,6 +32,7 @@ from ..core.step.ticks import NS_PER_S, Mode
 from ..core.step.vectors import Array
 from ..errors import LogError, count_nouns
 from ..files import digest_file
+from ..hooks import find_hook
 from ..log.log_file import LogFile
 from ..log.log_layout import EXECUTED_SITES_KEY, MAX_TIME_NS, RERUN_DRIVER
 from ..log.log_reader import Log, open_log
@@ -40,12 +41,12 @@ from ..log.mcap_reader import Progress
 from ..log.mcap_writer import Sink
 from ..log.provenance import collect_provenance
 from ..log.record_columns import Ints
-from ..log.ros2.viz_channels import VIZ_HZ, offer_views
 from ..log.site_log import SiteLog
+from ..log.view_rates import VIZ_HZ
 from ..net.messages import READABLE, State
 from ..net.wire import decode
+from ..own_code.code_consent import find_user_laws
 from ..results import Result, finite_or_none
-from ..scenario.code_consent import find_user_laws
 from .rerun_execution import (
     RerunExecution,
     RerunOverrides,
@@ -376,7 +377,7 @@ class Rerun(Result):
             epoch_unix_ns=epoch_unix_ns,
             provenance=collect_provenance(),
             facts=_collect_rerun_metadata(log, request),
-            make_views=offer_views(request.scenario, views_hz),
+            make_views=find_hook("offer the views of a log")(request.scenario, views_hz),
         )
 
         channels: dict[str, SiteChannels] = {}

@@ -63,7 +63,7 @@ _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 """Keys of a scenario that describe it and have no effect on a run."""
 
 
-class ChangedValue(NamedTuple):
+class _ChangedValue(NamedTuple):
     """One value of the scenario that a rerun of a log changes.
 
     Attributes:
@@ -98,8 +98,8 @@ class RerunRequest:
     scenario: Scenario
     replaced: tuple[str, ...]
     recorded: tuple[str, ...]
-    changes: list[ChangedValue]
-    without_effect: list[ChangedValue] = field(default_factory=list)
+    changes: list[_ChangedValue]
+    without_effect: list[_ChangedValue] = field(default_factory=list)
 
     @property
     def mode(self) -> str:
@@ -283,12 +283,12 @@ def _join_scenarios(
     return parse_scenario(joined.text, original.name)
 
 
-def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
+def _find_changes(original: Scenario, other: Scenario) -> list[_ChangedValue]:
     """Returns the values that differ between two scenarios."""
     before = dict(flatten_table(msgspec.to_builtins(original)))
     after = dict(flatten_table(msgspec.to_builtins(other)))
     return [
-        ChangedValue(key, before.get(key), after.get(key))
+        _ChangedValue(key, before.get(key), after.get(key))
         for key in before | after
         if before.get(key) != after.get(key)
     ]

@@ -36,6 +36,7 @@ from ..core.step.ticks import (
     describe_mode,
 )
 from ..errors import CodeFailed, count_nouns
+from ..hooks import find_hook
 from ..log.accounting import Account
 from ..log.log_file import LogFile
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
@@ -45,17 +46,17 @@ from ..log.mcap_reader import read_contents
 from ..log.mcap_writer import Sink
 from ..log.message_identity import compute_virtual_boot
 from ..log.provenance import collect_provenance
-from ..log.ros2.viz_channels import VIZ_HZ, offer_views
+from ..log.view_rates import VIZ_HZ
 from ..net import topics
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.timing import LoopStats
 from ..net.topics import number_message, skipped_numbers
 from ..net.wire import encode, encode_state
+from ..own_code.imported_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
-from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.program_hand import POLICY, make_hand_players
-from ..scenario.own_plant import PlantPlayer, make_plant_players
+from ..scenario.plant_player import PlantPlayer, make_plant_players
 from ..scenario.validate import refuse_external_arms
 from .resumption import read_output, select_peer_channels
 from .virtual_network import Network, PromptNetwork
@@ -574,7 +575,7 @@ def write_virtual_log(
         network: Network between the sites, see `execute_virtual`.
         stopped: Function that is called after each tick. The run ends if it returns True.
         views_hz: Rate of the additional channels for viewers, in Hz, see
-            `log.ros2.viz_channels`.
+            `log.view_rates`.
         hands: Actions of live operators, see `execute_virtual`. They replace the programs that
             the scenario names as operators.
         commands: Changes that take effect during the run.
@@ -603,7 +604,7 @@ def write_virtual_log(
         driver="virtual",
         epoch_unix_ns=0,
         provenance=collect_provenance(),
-        make_views=offer_views(scenario, views_hz),
+        make_views=find_hook("offer the views of a log")(scenario, views_hz),
     )
     members: dict[str, _VirtualChannels] = {}
     within_limits = True

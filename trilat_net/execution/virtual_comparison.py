@@ -56,7 +56,7 @@ class RecordComparison(NamedTuple):
     first: RecordDifference | None
 
 
-class LateSample(NamedTuple):
+class _LateSample(NamedTuple):
     """Sample that had not arrived at its receiver when it should have come into use.
 
     A sample is the state that a site publishes in one tick. It is due after the delay that the
@@ -123,7 +123,7 @@ def _compare_records(
     return RecordComparison(records, identical, first)
 
 
-def find_absent_samples(log: Log) -> list[LateSample]:
+def find_absent_samples(log: Log) -> list[_LateSample]:
     """Finds every sample that was late or lost in the network of a live session.
 
     A sample is the state that a site (process that runs one arm) sends in one tick (period of
@@ -139,13 +139,13 @@ def find_absent_samples(log: Log) -> list[LateSample]:
     Returns:
         The samples, by the tick in which they were due. Empty if all were in time.
     """
-    absent: list[LateSample] = []
+    absent: list[_LateSample] = []
     for name in log.sites:
         absent += _find_absent_at_site(log, name)
     return sorted(absent, key=lambda sample: sample.due_tick)
 
 
-def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
+def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
     """Returns the samples that had not arrived at one site when they were due.
 
     Args:
@@ -175,7 +175,7 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
             if due_tick is None or due_tick >= state.tick or site.is_measured(peer):
                 continue
             absent.append(
-                LateSample(
+                _LateSample(
                     site=name,
                     peer=site.peers[peer],
                     tick=tick,
@@ -195,7 +195,7 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
                 if due_tick is None or not _uses_older(part, sender, tick, due_tick):
                     continue
                 absent.append(
-                    LateSample(
+                    _LateSample(
                         site=name,
                         peer=sender,
                         tick=tick,
@@ -213,7 +213,7 @@ def _uses_older(part: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
     return bool((part.used[sender][row : row + 1] < tick).any())
 
 
-class VirtualComparison(NamedTuple):
+class _VirtualComparison(NamedTuple):
     """Comparison of the log of a live session with simulations of the same experiment.
 
     It shows whether the real network changed the result beyond the delays and losses that the
@@ -233,10 +233,10 @@ class VirtualComparison(NamedTuple):
 
     fed: RecordComparison
     plain: RecordComparison
-    absent: list[LateSample]
+    absent: list[_LateSample]
 
     @property
-    def late(self) -> list[LateSample]:
+    def late(self) -> list[_LateSample]:
         """List of the samples that arrived later than the scenario describes.
 
         A sample is the state that a site (process that runs one arm) sends.
@@ -244,7 +244,7 @@ class VirtualComparison(NamedTuple):
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
-    def lost(self) -> list[LateSample]:
+    def lost(self) -> list[_LateSample]:
         """List of the samples that the network lost, although it should have delivered them.
 
         A sample is the state that a site (process that runs one arm) sends. Losses that the
@@ -262,7 +262,7 @@ class VirtualComparison(NamedTuple):
         return self.absent[0].due_tick if self.absent else None
 
 
-def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualComparison:
+def compare_with_virtual(log: Log, progress: Progress | None = None) -> _VirtualComparison:
     """Compares a log with two simulations of its scenario in virtual time.
 
     In the first simulation, samples arrive as in the log; in the second one, they arrive at
@@ -323,7 +323,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
             plain = RecordComparison(0, 0, None)
         else:
             plain = _compare_records(log, execute(None, total // 2), arrivals=False)
-        return VirtualComparison(fed, plain, find_absent_samples(log))
+        return _VirtualComparison(fed, plain, find_absent_samples(log))
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:

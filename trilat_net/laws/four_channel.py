@@ -40,7 +40,7 @@ _NEUTRAL = (
 
 
 @compiled
-def send_acceleration(law: Any, now: LawInput) -> None:
+def _send_acceleration(law: Any, now: LawInput) -> None:
     """Sends the acceleration of the arm to the peers.
 
     It is the solution qdd of M qdd = tau - tau_x - bias, with tau within its limits, where M is
@@ -169,7 +169,7 @@ class FourChannel(ControlLaw):
                         tau += inertia * peer_qdd[j]
             now.tau[i] = tau
         if self.acceleration > 0.0:
-            send_acceleration(self, now)
+            _send_acceleration(self, now)
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the gains of spring, damper and felt torque for the linear analysis.

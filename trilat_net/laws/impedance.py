@@ -352,7 +352,7 @@ class Impedance(ControlLaw):
         return {**gains, "follows": site.role == "slave"}
 
 
-def find_stiffest_wall(
+def _find_stiffest_wall(
     laws: Sequence[Any],
     dominance_factors: Array,
     slave: int,
@@ -417,7 +417,7 @@ def _compute_loop_gain(
     damping: float,
     hands: Sequence[Sequence[ArmLoad]],
 ) -> Array:
-    """Returns the gain of the loop of `find_stiffest_wall` on a grid of frequencies.
+    """Returns the gain of the loop of `_find_stiffest_wall` on a grid of frequencies.
 
     Args:
         laws: Settings of the law of each site.
@@ -494,7 +494,7 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
         return "no bound is known for walls, because of the hands at the masters"
     factors = situation.alpha[slave]
     stiffnesses = [
-        find_stiffest_wall(situation.laws, factors, slave, selection)
+        _find_stiffest_wall(situation.laws, factors, slave, selection)
         for selection in selections
     ]
     stiffest = min(stiffnesses)

@@ -648,6 +648,8 @@ def make_instance(
 ) -> Any:
     """Returns an instance of a user's class, created from its context and settings.
 
+    A class without a constructor needs neither.
+
     Args:
         kind: The class.
         code: Name of the class for errors.
@@ -658,8 +660,9 @@ def make_instance(
     Raises:
         ScenarioError: The class raised an exception. The user's code may raise any.
     """
+    takes_facts = kind.__init__ is not object.__init__ or kind.__new__ is not object.__new__
     try:
-        return kind(context, **settings)
+        return kind(context, **settings) if takes_facts else kind()
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
         error_path = path or f"sites.{context.site}.control"

@@ -51,7 +51,7 @@ _SLACK_NM = 1e-9
 
 
 @compiled
-def book_leader_work(
+def _book_leader_work(
     now: LawInput,
     j: int,
     i: int,
@@ -82,7 +82,7 @@ def book_leader_work(
 
 
 @compiled
-def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
+def _observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     """Updates how much energy the leader's arm may still take out of a coupling.
 
     A coupling connects the leader to an arm that follows it. The leader feels a torque of the
@@ -114,7 +114,7 @@ def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     law.E_known[index] = reported_energy
     if law.by_step:
         last_step = now.q[i] - now.q_before[i]
-        available_energy += book_leader_work(
+        available_energy += _book_leader_work(
             now=now,
             j=j,
             i=i,
@@ -125,7 +125,7 @@ def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
 
 
 @compiled
-def invert_inertia(law: Any, now: LawInput) -> None:
+def _invert_inertia(law: Any, now: LawInput) -> None:
     """Writes the inverse M^-1 of the arm's inertia matrix to `law.inverse`, row by row.
 
     The method is Gauss-Jordan elimination. If the arm's parameters are unknown, M is zero,
@@ -155,7 +155,7 @@ def invert_inertia(law: Any, now: LawInput) -> None:
 
 
 @compiled
-def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
+def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
     """Writes the torque that the leader feels in its coupling to follower j.
 
     The controller reduces the follower's torque to a magnitude that the known energy pays for
@@ -236,7 +236,7 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 
 
 @compiled
-def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
+def _find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     """Returns the energy that may still be used to move the follower in one coupling, J.
 
     A coupling connects a leader to this arm, its follower. The known energy is the sum of three
@@ -261,7 +261,7 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
 
 
 @compiled
-def limit_follower_velocity(
+def _limit_follower_velocity(
     law: Any,
     now: LawInput,
     j: int,
@@ -274,8 +274,8 @@ def limit_follower_velocity(
     This arm follows a peer, another arm, by a spring and a damper whose goal moves with the
     velocity of the peer. If the goal moves with the velocity v during a period h, the force F
     of spring and damper does the work F v h. This work must not exceed the known energy: the
-    energy that the peer is known to have put in and that is not spent (`find_known_energy`). If
-    the work is too large, the velocity is reduced so that it equals the known energy:
+    energy that the peer is known to have put in and that is not spent (`_find_known_energy`).
+    If the work is too large, the velocity is reduced so that it equals the known energy:
 
         F v_reduced h = known energy,    v_reduced = v + (known energy - F v h) / (F h)
 
@@ -298,7 +298,7 @@ def limit_follower_velocity(
     index = j * now.joints + i  # position in lists with one entry per coupling and joint
     h = now.h_s
     peer_velocity = now.peers[j].qd[i]
-    known_J = find_known_energy(law, now, j, i)
+    known_J = _find_known_energy(law, now, j, i)
     if law.by_step:
         known_J = max(known_J - price, 0.0)
     law.v_led[index] = peer_velocity
@@ -312,7 +312,7 @@ def limit_follower_velocity(
 
 
 @compiled
-def compute_drift_velocity(
+def _compute_drift_velocity(
     law: Any,
     now: LawInput,
     i: int,
@@ -366,7 +366,7 @@ def compute_drift_velocity(
 
 
 @compiled
-def find_affordable_velocity(
+def _find_affordable_velocity(
     law: Any,
     now: LawInput,
     j: int,
@@ -379,7 +379,7 @@ def find_affordable_velocity(
     the torque of the spring does work. Delays could make this work larger than the energy that
     the peer has put in. The arms would then be driven by energy from nowhere. Therefore the
     velocity is reduced if its work would exceed the energy that the peer is known to have put
-    in and that is not spent (`find_known_energy`).
+    in and that is not spent (`_find_known_energy`).
 
     Args:
         law: The law. `law.v_led` is the velocity of the peer, which may have been reduced
@@ -393,7 +393,7 @@ def find_affordable_velocity(
     index = j * now.joints + i  # position in lists with one entry per coupling and joint
     # Work in this period for each rad/s of the velocity, J s/rad. It has the sign of the force.
     work_per_velocity = now.peers[j].alpha * force * now.h_s
-    known_J = max(find_known_energy(law, now, j, i), 0.0)
+    known_J = max(_find_known_energy(law, now, j, i), 0.0)
     velocity = float(law.v_led[index])
     if law.controlled and work_per_velocity * velocity > known_J:
         # The work is positive, so the quotient has the sign of the velocity and is smaller.
@@ -402,7 +402,7 @@ def find_affordable_velocity(
 
 
 @compiled
-def book_follower(
+def _book_follower(
     law: Any,
     now: LawInput,
     j: int,
@@ -460,7 +460,7 @@ def book_follower(
 
 
 @compiled
-def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None:
+def _charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None:
     """Subtracts energy that the follower used in the last period from the couplings' accounts.
 
     Before a control period, each coupling (the connection to an arm that is followed) pays for
@@ -509,7 +509,7 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
 
 
 @compiled
-def settle_follower(
+def _settle_follower(
     law: Any,
     now: LawInput,
     i: int,
@@ -551,7 +551,7 @@ def settle_follower(
         for j in range(peers):
             index = j * n + i
             if sweep > 0:
-                law.v_led[index] = find_affordable_velocity(
+                law.v_led[index] = _find_affordable_velocity(
                     law=law,
                     now=now,
                     j=j,
@@ -568,7 +568,7 @@ def settle_follower(
             share = law.left_J[j * n + i] / available_J
         drift = share * force * drift_velocity * h
         peer_force = now.peers[j].alpha * force
-        book_follower(
+        _book_follower(
             law=law,
             now=now,
             j=j,
@@ -585,7 +585,7 @@ def settle_follower(
 
 
 @compiled
-def follow_peers(law: Any, now: LawInput, i: int) -> None:
+def _follow_peers(law: Any, now: LawInput, i: int) -> None:
     """Computes the torque with which a joint follows its peers, and the motion of its goal.
 
     A spring and a damper pull the joint to a goal that moves with the velocities of the peers,
@@ -638,7 +638,7 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
         limited_torque = max(low, spring_bounded_above)
         mean_stretch = stretch - 0.5 * limited_torque / K
         spring_J = limited_torque * mean_stretch
-    charge_unpaid_energy(law, now, i, spring_J)
+    _charge_unpaid_energy(law, now, i, spring_J)
     law.force[i] = force
 
     # The expected elongation of the spring in this period.
@@ -652,7 +652,7 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
         peer_force = alpha * force
         peer_price = alpha * price
         now.sent[j].F[i] = peer_force
-        remaining_J = limit_follower_velocity(
+        remaining_J = _limit_follower_velocity(
             law=law,
             now=now,
             j=j,
@@ -670,14 +670,14 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
     costs_are_covered = least_J >= 0.0
     if has_drift_control and available_J > 0.0 and costs_are_covered:
         error = target - law.goal[i] - h * velocity
-        drift_velocity = compute_drift_velocity(
+        drift_velocity = _compute_drift_velocity(
             law=law,
             now=now,
             i=i,
             error=error,
             available_J=available_J,
         )
-    settle_follower(
+    _settle_follower(
         law=law,
         now=now,
         i=i,
@@ -809,7 +809,7 @@ class Tdpa(EnergyLaw):
         """
         n = now.joints
         peers = len(now.peers)
-        invert_inertia(self, now)
+        _invert_inertia(self, now)
         for i in range(n):
             limit = self.tau_limit[i]
             self.torque_change[i] = self.carried[i] - now.tau_before[i]
@@ -822,12 +822,12 @@ class Tdpa(EnergyLaw):
                 last_step = now.q[i] - now.q_before[i]
                 predicted_step += predicted_step - last_step
             self.predicted_step[i] = predicted_step
-            follow_peers(self, now, i)
+            _follow_peers(self, now, i)
             self.torque_change[i] += self.force[i] / self.beta
 
             for j in range(peers):
                 index = j * n + i
-                observe_leader(self, now, j, i)
+                _observe_leader(self, now, j, i)
                 last_force = self.F_led[index]
                 self.F_now[index] = last_force
                 self.torque_change[i] -= last_force / self.beta
@@ -835,7 +835,7 @@ class Tdpa(EnergyLaw):
         for _ in range(SWEEPS):
             for i in range(n):
                 for j in range(peers):
-                    limit_leader_torque(self, now, j, i)
+                    _limit_leader_torque(self, now, j, i)
 
         for i in range(n):
             felt = 0.0
@@ -853,7 +853,7 @@ class Tdpa(EnergyLaw):
                 torque = reduction * self.F_now[index]
                 self.F_led[index] = torque
                 if not self.by_step:
-                    taken = book_leader_work(
+                    taken = _book_leader_work(
                         now=now,
                         j=j,
                         i=i,

@@ -70,7 +70,7 @@ STAMP_FILTER_TICKS = 20.0
 
 
 @compiled
-def replay_wave(
+def _replay_wave(
     law: Any,
     index: int,
     fresh: float,
@@ -102,7 +102,7 @@ def replay_wave(
 
     sign = 1.0 if owed_integral > 0.0 else -1.0
     mean_wave = owed / max(owed_s, CONCEALED_S, h)
-    # The other half of the reserve is for the ticks without a sample (`conceal_wave`).
+    # The other half of the reserve is for the ticks without a sample (`_conceal_wave`).
     free = energy - 0.5 * law.reserve
     available = max(free, 0.0)
     # Beside the wave f, an extra wave e costs f + e / 2 per unit of the integral.
@@ -121,7 +121,7 @@ def replay_wave(
 
 
 @compiled
-def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
+def _conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     """Returns the wave that acts on the arm in a period in which no message has arrived.
 
     A wave w in sqrt(W) carries the power w^2 / 2. The previous wave is repeated, but it is
@@ -135,7 +135,7 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     waves. `held_s` is the time for which waves have been repeated since the last message.
 
     If lost waves of the same sign are owed from earlier, a part of them is added to the
-    repeated wave (`replay_wave`).
+    repeated wave (`_replay_wave`).
 
     Args:
         law: The law, with its accounts.
@@ -157,7 +157,7 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     if law.owed_U[index] * held > 0.0:
         spent = 0.5 * held * held * h
         remaining = energy - spent
-        played = replay_wave(
+        played = _replay_wave(
             law=law,
             index=index,
             fresh=held,
@@ -171,7 +171,7 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
 
 
 @compiled
-def receive_wave(
+def _receive_wave(
     law: Any,
     now: LawInput,
     j: int,
@@ -210,7 +210,7 @@ def receive_wave(
     is_replay = law.playing == _REPLAY
     if not has_sample and is_replay:
         known_energy = sent.W[i]
-        played = conceal_wave(law, index, known_energy, h)
+        played = _conceal_wave(law, index, known_energy, h)
     elif has_sample:
         fresh = received.u[i]
         law.wave[index] = fresh
@@ -235,7 +235,7 @@ def receive_wave(
 
     # Choose the wave to play.
     if is_replay and has_sample:
-        played = replay_wave(
+        played = _replay_wave(
             law=law,
             index=index,
             fresh=fresh,
@@ -260,7 +260,7 @@ def receive_wave(
 
 
 @compiled
-def follow_wave(
+def _follow_wave(
     law: Any,
     now: LawInput,
     j: int,
@@ -307,7 +307,7 @@ def follow_wave(
 
 
 @compiled
-def close_wave_period(law: Any, now: LawInput, i: int) -> None:
+def _close_wave_period(law: Any, now: LawInput, i: int) -> None:
     """Updates the energy of this end of the lines after a control period.
 
     The energy H is what this site, the process of one arm, may send to its peers in waves,
@@ -351,7 +351,7 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
 
 
 @compiled
-def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
+def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
     """Scales down the waves of a joint if the site does not have the energy to send them.
 
     A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The
@@ -397,7 +397,7 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
         H[i] -= energy
 
 
-def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
+def _find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
     """Returns the impedance that a user stated for the line between two sites.
 
     A line is the virtual connection over which two sites exchange waves. The order of the two
@@ -502,7 +502,7 @@ class Wave(EnergyLaw):
         lines = {} if self.lines == "shares" else self.lines
         self.impedance: list[float] = []
         for peer in facts.peers:
-            line = find_line_impedance(lines, facts.site, peer)
+            line = _find_line_impedance(lines, facts.site, peer)
             if line is None:
                 self.impedance += self.b
             else:
@@ -555,7 +555,7 @@ class Wave(EnergyLaw):
         h = now.h_s
         peers = len(now.peers)
         for i in range(n):
-            close_wave_period(self, now, i)
+            _close_wave_period(self, now, i)
             if self.K[i] == 0.0:
                 # An end without a spring sends the motion of the period that has just ended.
                 step = now.q[i] - now.q_before[i]
@@ -565,7 +565,7 @@ class Wave(EnergyLaw):
                     c = math.sqrt(2.0 * b)
                     motion_wave = c * step / h
                     now.sent[j].u[i] = motion_wave - self.played[index]
-                send_waves(self, now, i, 0.0)
+                _send_waves(self, now, i, 0.0)
             carried = self.gravity * now.gravity[i]
             self.carried[i] = carried
             now.tau[i] = carried
@@ -586,7 +586,7 @@ class Wave(EnergyLaw):
                 b = self.impedance[index]
                 if b == 0.0:
                     continue
-                played = receive_wave(
+                played = _receive_wave(
                     law=self,
                     now=now,
                     j=j,
@@ -598,7 +598,7 @@ class Wave(EnergyLaw):
                     c = math.sqrt(2.0 * b)
                     force = c * played - b * now.qd[i]
                 else:
-                    force = follow_wave(
+                    force = _follow_wave(
                         law=self,
                         now=now,
                         j=j,
@@ -615,7 +615,7 @@ class Wave(EnergyLaw):
                 applied = limited - self.carried[i]
                 work = self.beta * applied * now.qd[i] * h
                 committed = work + self.spring_gain_J[i]
-                send_waves(self, now, i, committed)
+                _send_waves(self, now, i, committed)
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
@@ -792,7 +792,7 @@ class Wave(EnergyLaw):
             peer: Name of the site at the other end.
         """
         lines = {} if self.lines == "shares" else self.lines
-        line = find_line_impedance(lines, site, peer)
+        line = _find_line_impedance(lines, site, peer)
         if line is None:
             return self.b
         joints = len(self.b)

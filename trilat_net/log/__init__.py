@@ -2,4 +2,10 @@
 
 from ..hooks import register_hooks
 
-register_hooks(__name__, {"read the delays of a link": "log_reader:read_link_delays"})
+register_hooks(
+    __name__,
+    {
+        "offer the views of a log": "ros2.viz_channels:offer_views",
+        "read the delays of a link": "log_reader:read_link_delays",
+    },
+)

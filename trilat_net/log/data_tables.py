@@ -193,7 +193,7 @@ _COMPLETE_TEXTS = {
 """Meanings of fields whose text in the docstring refers to the previous field."""
 
 
-class FieldDoc(NamedTuple):
+class _FieldDoc(NamedTuple):
     """Documents one field of a message, for the head of an exported table.
 
     Attributes:
@@ -208,7 +208,7 @@ class FieldDoc(NamedTuple):
 
 
 @cache
-def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
+def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, _FieldDoc]:
     """Collects the documentation of the fields of a message type.
 
     The meanings are taken from the docstring of the type, and the units from its JSON Schema.
@@ -228,7 +228,7 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
         default_unit = _UNITS_BY_NAME.get(name, _UNITS_BY_ENDING.get(ending, ""))
         text = texts.get(name, entry.get("description", ""))
         one_line = " ".join(text.split()).rstrip(".")
-        docs[name] = FieldDoc(entry.get("x-unit", default_unit), one_line, entry["type"])
+        docs[name] = _FieldDoc(entry.get("x-unit", default_unit), one_line, entry["type"])
     return docs
 
 

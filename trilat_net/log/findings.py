@@ -18,7 +18,7 @@ _MAX_LISTED_PROBLEMS = 1000
 """Largest number of problems that a finding stores. Further problems are only counted."""
 
 
-class ProblemPlace(NamedTuple):
+class _ProblemPlace(NamedTuple):
     """A problem in a file, and the place where it was found.
 
     Attributes:
@@ -57,7 +57,7 @@ class Finding:
     text: str = ""
     passed: bool = True
     judged: bool = True
-    places: list[ProblemPlace] = field(default_factory=list)
+    places: list[_ProblemPlace] = field(default_factory=list)
     wrong: int = 0
 
     def add(self, file: str, offset: int | None, text: str) -> None:
@@ -72,7 +72,7 @@ class Finding:
         self.passed = False
         self.wrong += 1
         if len(self.places) < _MAX_LISTED_PROBLEMS:
-            self.places.append(ProblemPlace(file, offset, text))
+            self.places.append(_ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
         """Summarises the problems of the check in one line.

@@ -53,10 +53,11 @@ from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.topics import count_under_way
 from ..net.wire import decode
+from ..own_code.code_consent import LawFiles, allow_logged_code
 from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
-from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
+from ..scenario.operators.program_hand import FAILED_HAND
 from ..scenario.sample_uses import PictureDelay
 from .accounting import LAST, describe_unknown_ends
 from .data_tables import (
@@ -371,11 +372,22 @@ class Log(Result, Mapping[str, SiteLog]):
         speed = f"{speeds_rad_s[joint]:.3g} rad/s (limit {limits_rad_s[joint]:g} rad/s)"
         return f"{name} joint {joint + 1} reached {speed} at {diverged_s:.3f} s"
 
-    def warn_if_diverged(self) -> None:
-        """Issues a Python warning if the run diverged.
+    @property
+    def failed_hands(self) -> list[str]:
+        """Sentences that say which programs failed while they moved an arm, when, and why."""
+        return [
+            event.text
+            for event in self.events
+            if event.kind == "hand" and FAILED_HAND in event.text
+        ]
+
+    def warn_of_failures(self) -> None:
+        """Issues a Python warning if the run diverged or a program that moves an arm failed.
 
         The warning names the line of code that called the caller of this method.
         """
+        for failure in self.failed_hands:
+            warnings.warn(failure, RuntimeWarning, stacklevel=3)
         if self.diverged_s is not None:
             warnings.warn(
                 f"the run diverged at {self.diverged_s:.3f} s, and ends there: "

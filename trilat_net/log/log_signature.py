@@ -48,7 +48,7 @@ _MAX_BYTES = 65_536
 """Largest size of the file of a key or of a signature, in bytes."""
 
 
-class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of a signature's file.
 
     Attributes:
@@ -155,7 +155,7 @@ def sign_log(
     public_key = key.public_key().public_bytes(
         serialization.Encoding.Raw, serialization.PublicFormat.Raw
     )
-    signature = LogSignature(
+    signature = _LogSignature(
         format=_FORMAT,
         chain=dict(chain),
         public_key=base64.b64encode(public_key).decode(),
@@ -212,7 +212,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
     file = path.with_name((path.name or "log") + SUFFIX)
     try:
         with open_regular(file) as stream:
-            stated = msgspec.json.decode(stream.read(_MAX_BYTES), type=LogSignature)
+            stated = msgspec.json.decode(stream.read(_MAX_BYTES), type=_LogSignature)
         signature = base64.b64decode(stated.signature, validate=True)
     except FileNotFoundError:
         return f"there is no signature file {file}"

@@ -39,14 +39,14 @@ PutMessage = Callable[[str, bytes, int, int], None]
 """Function that writes one message: topic, bytes, sending and arrival time in Unix ns."""
 
 
-class ViewChannels(Protocol):
+class _ViewChannels(Protocol):
     """Numbers of the channels for viewers in a file, by topic."""
 
     def __getitem__(self, topic: str) -> int:
         """Returns the number of a topic's channel, and registers the channel if necessary."""
 
 
-class LogViews(Protocol):
+class _LogViews(Protocol):
     """Derives messages for general viewers from the messages of a session.
 
     `ros2.viz_channels.VizChannels` derives standard messages of ROS 2.
@@ -62,7 +62,7 @@ class LogViews(Protocol):
     def most_bytes(self) -> int:
         """Upper bound for the size of the messages that are not written yet, in bytes."""
 
-    def open_channels(self, file: McapWriter) -> ViewChannels:
+    def open_channels(self, file: McapWriter) -> _ViewChannels:
         """Returns the channels for viewers of a file, which are registered when needed.
 
         Args:
@@ -77,7 +77,7 @@ class LogViews(Protocol):
         """
 
 
-MakeViews = Callable[[str, int, PutMessage], LogViews]
+MakeViews = Callable[[str, int, PutMessage], _LogViews]
 """Function that creates the views of one file.
 
 Its arguments are the name of the session, the Unix time of tick 0 in ns, and the function that
@@ -128,14 +128,14 @@ class LogWriter:
         self.records_digest = ""
         # Reason why no message can be added any more. Empty while the log is open.
         self._end_reason = ""
-        self._views: LogViews | None = None
+        self._views: _LogViews | None = None
         self._view_receivers: dict[str, ReceiveMessage] = {}
         if make_views is not None:
             self._views = make_views(session, epoch_unix_ns, self._add_view_message)
             self._view_receivers = self._views.receivers
         self._last_log_ns = 0
         self._file = McapWriter(stream, f"trilat-net {provenance['version_trilat-net']}")
-        self._view_channels: ViewChannels = {}
+        self._view_channels: _ViewChannels = {}
         if self._views is not None:
             self._view_channels = self._views.open_channels(self._file)
         about = {

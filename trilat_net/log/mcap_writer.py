@@ -101,7 +101,7 @@ def _pack_long_bytes(data: bytes) -> bytes:
     return struct.pack("<Q", len(data)) + data
 
 
-def pack_record(opcode: int, body: bytes) -> bytes:
+def _pack_record(opcode: int, body: bytes) -> bytes:
     """Encodes a record of an MCAP file: its kind, the length of its content, and the content.
 
     Args:
@@ -152,7 +152,7 @@ class McapWriter:
         self._chain = RunningDigest()
         header = _pack_text(profile) + _pack_text(library)
         self._chain.add_entry(Opcode.HEADER, header)
-        self._write(MAGIC + pack_record(Opcode.HEADER, header))
+        self._write(MAGIC + _pack_record(Opcode.HEADER, header))
 
     def _write(self, data: bytes) -> int:
         """Writes bytes, and returns their offset in the file."""
@@ -163,7 +163,7 @@ class McapWriter:
 
     def _add_to_summary(self, opcode: Opcode, body: bytes) -> bytes:
         """Adds a record to the summary of the file, and returns the encoded record."""
-        record = pack_record(opcode, body)
+        record = _pack_record(opcode, body)
         self._summary[opcode] += record
         self._summary_counts[opcode] += 1
         return record
@@ -289,7 +289,7 @@ class McapWriter:
         content = _pack_text(name) + _pack_text_map(data)
         if name != DIGESTS:
             self._chain.add_entry(Opcode.METADATA, content)
-        record = pack_record(Opcode.METADATA, content)
+        record = _pack_record(Opcode.METADATA, content)
         offset = self._write(record)
         index = struct.pack("<QQ", offset, len(record)) + _pack_text(name)
         self._add_to_summary(Opcode.METADATA_INDEX, index)
@@ -311,7 +311,7 @@ class McapWriter:
         body = times + names + _pack_long_bytes(data)
         body += struct.pack("<I", zlib.crc32(body))
         self._chain.add_entry(Opcode.ATTACHMENT, body)
-        record = pack_record(Opcode.ATTACHMENT, body)
+        record = _pack_record(Opcode.ATTACHMENT, body)
         offset = self._write(record)
         extent = struct.pack("<QQ", offset, len(record))
         index = extent + times + struct.pack("<Q", len(data)) + names
@@ -366,7 +366,7 @@ class McapWriter:
         unpacked_bytes = len(self._open_chunk)
         crc = zlib.crc32(self._open_chunk)
         head = _CHUNK.pack(start_ns, end_ns, unpacked_bytes, crc) + _pack_text(_COMPRESSION)
-        chunk_record = pack_record(Opcode.CHUNK, head + _pack_long_bytes(packed))
+        chunk_record = _pack_record(Opcode.CHUNK, head + _pack_long_bytes(packed))
         chunk_offset = self._write(chunk_record)
 
         indexes_start = self.position
@@ -376,7 +376,7 @@ class McapWriter:
             # entries, each of which consists of 64-bit numbers with 8 bytes.
             entries_bytes = 8 * len(entries)
             body = struct.pack(f"<HI{len(entries)}Q", channel, entries_bytes, *entries)
-            index_offset = self._write(pack_record(Opcode.MESSAGE_INDEX, body))
+            index_offset = self._write(_pack_record(Opcode.MESSAGE_INDEX, body))
             index_offsets += struct.pack("<HQ", channel, index_offset)
             self._entries[channel] = []
         indexes_bytes = self.position - indexes_start
@@ -400,7 +400,7 @@ class McapWriter:
         """
         if self._open_chunk:
             self._close_chunk()
-        self._write(pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
+        self._write(_pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
         self._add_to_summary(Opcode.STATISTICS, self._pack_statistics())
 
         summary_start = self.position
@@ -412,7 +412,7 @@ class McapWriter:
             group_start = self._write(bytes(group))
             crc = zlib.crc32(group, crc)
             offset_body = struct.pack("<BQQ", opcode, group_start, len(group))
-            offsets += pack_record(Opcode.SUMMARY_OFFSET, offset_body)
+            offsets += _pack_record(Opcode.SUMMARY_OFFSET, offset_body)
         offsets_start = self._write(offsets)
 
         # The checksum covers the summary and the footer, up to the checksum itself.

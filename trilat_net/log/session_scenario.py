@@ -11,7 +11,7 @@ from typing import Protocol
 from ..records import Layout
 
 
-class SiteRate(Protocol):
+class _SiteRate(Protocol):
     """A site of a scenario, which runs one arm."""
 
     @property
@@ -39,7 +39,7 @@ class SessionScenario(Protocol):
         """Names of the sites, in the order of the scenario file."""
 
     @property
-    def sites(self) -> Mapping[str, SiteRate]:
+    def sites(self) -> Mapping[str, _SiteRate]:
         """The sites by name."""
 
     @property

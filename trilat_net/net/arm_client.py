@@ -262,7 +262,7 @@ class SiteClient:
             self._is_over = self._is_over or is_gone
 
 
-class OutsideClient(SiteClient):
+class _OutsideClient(SiteClient):
     """Connection of a program that also sends messages to one channel of a site.
 
     `ArmClient` and `SwitchClient` define the channel. The object is a context manager that
@@ -329,7 +329,7 @@ class OutsideClient(SiteClient):
         return cls(bus, SystemClock(), session, site)
 
 
-class SwitchClient(OutsideClient):
+class SwitchClient(_OutsideClient):
     """Connection of the program of a dead-man switch to the site of the arm.
 
     The program reports regularly whether somebody holds the switch. The arm stops if the switch
@@ -358,7 +358,7 @@ class SwitchClient(OutsideClient):
         self._sender.send(ArmEnable, held=held)
 
 
-class ArmClient(OutsideClient):
+class ArmClient(_OutsideClient):
     """Connection of the driver of an external arm to the site that controls the arm.
 
     The driver sends measurements with `send`, and reads the torque to apply with `torque`. The

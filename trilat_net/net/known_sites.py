@@ -44,7 +44,7 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
 """Flags that create a file, and fail if the file exists already."""
 
 
-class KnownSite(msgspec.Struct, frozen=True):
+class _KnownSite(msgspec.Struct, frozen=True):
     """Content of the file in which a running site stores how it can be reached.
 
     A site is a process that runs one arm and its control loop. With this file, other programs
@@ -110,7 +110,7 @@ def make_site_known(
         stop: The message that `trilat stop` sends to stop the arm, encoded.
     """
     endpoints = [*connection.listen, *(connection.connect or ())]
-    known = KnownSite(
+    known = _KnownSite(
         session=session,
         site=site,
         sites=sites,
@@ -137,7 +137,7 @@ def make_site_known(
             (_find_folder() / f"{boot:016x}.json").unlink()
 
 
-def find_known_sites(session: str) -> list[KnownSite]:
+def find_known_sites(session: str) -> list[_KnownSite]:
     """Lists the sites of a session that run on this machine.
 
     The files of sites whose process is gone are removed.
@@ -154,7 +154,7 @@ def find_known_sites(session: str) -> list[KnownSite]:
         for file in sorted(_find_folder().glob("*.json")):
             # A file that is half written, or of another program, is skipped.
             with suppress(OSError, msgspec.MsgspecError):
-                known = msgspec.json.decode(file.read_bytes(), type=KnownSite)
+                known = msgspec.json.decode(file.read_bytes(), type=_KnownSite)
                 if known.machine != machine or not _is_alive(known.pid):
                     file.unlink()
                 elif known.session == session:
@@ -173,7 +173,7 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def _list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
+def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
     """Returns the network endpoints at which some sites can be reached, each endpoint once.
 
     Args:
@@ -298,7 +298,7 @@ def _print(text: object) -> None:
     print("".join(letters), flush=True)
 
 
-def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
+def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: str) -> bool:
     """Sends the order to stop to sites until each has replied, and prints the replies.
 
     If two sessions with the same name run on this machine, the sites of both are stopped. A

@@ -14,10 +14,5 @@ register_hooks(
         "render a result as HTML": "result_text:render_html",
         "render a site's records as HTML": "site_html:render_site_html",
         "plot a log": "column_plot:plot_log",
-        "describe a premise": "premise_text:describe_premise",
-        "describe missing functionals": "premise_text:describe_missing_functionals",
-        "describe closed groups": "premise_text:describe_closed_groups",
-        "describe evidence": "premise_text:describe_evidence",
-        "list the faults of evidence": "premise_text:list_evidence_faults",
     },
 )

@@ -185,11 +185,11 @@ def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """
-    sentences = [explain_judgement(certificate), *certificate.remarks]
+    sentences = [_explain_judgement(certificate), *certificate.remarks]
     return [CertificateLine("note", sentence) for sentence in sentences if sentence]
 
 
-def explain_judgement(certificate: Certificate) -> str:
+def _explain_judgement(certificate: Certificate) -> str:
     """Returns what a judgement means for small disturbances, as a sentence in plain words.
 
     Args:
@@ -292,7 +292,8 @@ def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[Certifica
         return []  # the text about the pushes states no rate of a push
     if f"{roots.rate_per_s:+.3g}" == f"{worst.rate_per_s:+.3g}":
         return []
-    accuracy = "exact" if roots.exact else "an approximation"
+    is_exact = roots.exact and not roots.is_numerical
+    accuracy = "exact" if is_exact else "an approximation"
     text = (
         f"of the two rates, exp(rate t), that of the roots is {accuracy}, for small motions "
         "near the final pose; that of the pushes is measured along this run, from "

@@ -13,7 +13,7 @@ Invariant:
     - Every spike of the log is on the page, because decimation keeps the least and the largest
       value of a bucket.
     - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `PageCharts.missing` names it, so that the page can say so.
+      `_PageCharts.missing` names it, so that the page can say so.
     - Numbers are base64 text of little-endian int32 and float32. This is a third of their
       length as decimal text.
 """
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..analysis import site_signals
 from ..analysis.arm_rows import joint_positions_m
-from ..analysis.site_signals import decimate
+from ..analysis.link_summary import measure_delay_distributions
 from ..analysis.timeline import (
     find_mode_intervals,
     list_changes,
@@ -38,7 +38,7 @@ from ..core.step.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
-from . import style
+from . import plot_signals, style
 from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses
 from .page_data import (
@@ -59,6 +59,7 @@ from .page_data import (
     TimeChart,
 )
 from .page_leaders import caption_site, list_lead_bars, trace_leads
+from .plot_signals import decimate
 
 Values = NDArray[Any]
 """Numbers of any type."""
@@ -82,7 +83,7 @@ PICTURE_SIDE = 4.0
 """Longer side of a scaled picture, in the unit of the line widths of the page."""
 
 
-class PageCharts(NamedTuple):
+class _PageCharts(NamedTuple):
     """The charts of a report's page, as `ChartBuilder.build` returns them.
 
     Attributes:
@@ -145,7 +146,7 @@ class ChartBuilder:
         buckets = BUCKET_BUDGET // (columns_per_site * len(log.sites))
         self._buckets = max(_MIN_BUCKETS, min(_MAX_BUCKETS, buckets))
 
-    def build(self) -> PageCharts:
+    def build(self) -> _PageCharts:
         """Computes all charts of the page.
 
         Returns:
@@ -191,7 +192,7 @@ class ChartBuilder:
             spans=spans,
             bounds_m=[self.units_per_m * bound for bound in self.bounds_m],
         )
-        return PageCharts(data, missing)
+        return _PageCharts(data, missing)
 
     def _build_overview_charts(self) -> Iterator[TimeChart]:
         """Yields the two charts of the first screen: the error and the delay of each site.
@@ -200,7 +201,7 @@ class ChartBuilder:
         oldest sample that its controller used.
         """
         log = self._log
-        unit = site_signals.shared_unit(log)
+        unit = plot_signals.shared_unit(log)
         limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
         stated = [line for site in log.sites for line in self._list_stated_delays(site)]
         has_one_delay = len({line.value for line in stated}) == 1
@@ -218,7 +219,7 @@ class ChartBuilder:
             title="Delay that each controller experienced",
             note="Dashed: the stated delay." if has_one_delay else "",
             unit="ms",
-            series=self._add_maxima(lambda site: site_signals.sample_ages_ms(log, site)),
+            series=self._add_maxima(lambda site: plot_signals.sample_ages_ms(log, site)),
             lines=[self._draw_limit(stated[0].value)] if has_one_delay else [],
             zero=True,
             margin=0.05,
@@ -272,7 +273,7 @@ class ChartBuilder:
         torque.
         """
         log = self._log
-        operated = site_signals.sites_with_operator(log)
+        operated = plot_signals.sites_with_operator(log)
         if operated:
             series = self._add_signal(site_signals.external_torques, operated)
             title = "operator torque on the arm"
@@ -286,7 +287,7 @@ class ChartBuilder:
         yield from self._chart_joints(
             section="errors",
             title="tracking error",
-            unit=site_signals.shared_unit(log),
+            unit=plot_signals.shared_unit(log),
             series_by_site=errors,
             titles=axes,
         )
@@ -487,7 +488,7 @@ class ChartBuilder:
         for site in self._log.sites:
             records = self._log[site]
             actual = site_signals.joint_angles(records)
-            desired = site_signals.reference_angles(records)
+            desired = plot_signals.reference_angles(records)
             for joint, name in enumerate(self._joint_titles[: actual.shape[1]]):
                 angles = np.stack([actual[:, joint], desired[:, joint]], axis=1)
                 table = self._add_records(site, angles)
@@ -556,7 +557,7 @@ class ChartBuilder:
         """
         log = self._log
         for site in log.sites:
-            ages_ms = site_signals.sample_ages_ms(log, site)
+            ages_ms = plot_signals.sample_ages_ms(log, site)
             table = self._add_records(site, ages_ms)
             series = [
                 self._make_series(peer, table, column, label=f"{peer} → {site}")
@@ -614,7 +615,7 @@ class ChartBuilder:
 
         A curve at x shows the percentage of ages, or of delays, that are at most x ms.
         """
-        measured = age_and_lateness.measure_delay_distributions(self._log)
+        measured = measure_delay_distributions(self._log)
         x_ms = age_and_lateness.choose_delay_axis_ms(measured)
         for site in self._log.sites:
             series = []
@@ -687,7 +688,7 @@ class ChartBuilder:
             return self._build_chain(index, site)
         records = self._log[site]
         actual = site_signals.joint_angles(records)
-        desired = site_signals.reference_angles(records)
+        desired = plot_signals.reference_angles(records)
         bodies = self._trace_bodies(site, np.arange(len(records)))
         table = self._add_records(site, np.hstack([actual, desired, *bodies]))
         return PlanarArm(
@@ -719,7 +720,7 @@ class ChartBuilder:
         instants = np.linspace(0, last, _CHAIN_INSTANTS).astype(np.int64)
         rows = np.unique(instants)  # short logs have fewer records than instants
 
-        desired_q = site_signals.reference_angles(records)
+        desired_q = plot_signals.reference_angles(records)
         actual_m = joint_positions_m(arm, records.q[rows])
         desired_m = joint_positions_m(arm, desired_q[rows])
         pictures = (

@@ -99,8 +99,9 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
         yield "A stability condition of its control law holds \\cite{Nuno2009}."
     if certificate.has_functional:
         yield (
-            "The premises of the theorem on adaptive dual-user teleoperation were compared "
-            "with the run \\cite{Motaharifar2016}."
+            "The premises of the theorem on adaptive dual-user teleoperation "
+            "\\cite{Motaharifar2016}, which holds in continuous time and whose proof was "
+            "corrected in trilat-net \\cite{trilat_net}, were compared with the run."
         )
     if decision.reasons:
         yield f"Findings that prevent a better judgement: {'; '.join(decision.reasons)}."

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..analysis.judge import certify_run
-from ..analysis.site_signals import find_error_of_last_second, shared_unit
+from ..analysis.site_signals import find_error_of_last_second
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
 from ..execution.log_checks import check_log_files
 from ..execution.virtual_comparison import simulate_without_operators
@@ -30,9 +30,9 @@ from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
-from ..scenario.code_consent import may_run_user_laws
+from ..own_code.code_consent import may_run_user_laws
+from ..own_code.imported_code import allowed_code
 from ..scenario.expect import END_WINDOW_S
-from ..scenario.imported_code import allowed_code
 from ..workers import worker_pool
 from . import terminal_output
 from .certificate_text import (
@@ -41,6 +41,7 @@ from .certificate_text import (
     describe_in_words,
     describe_theorem,
 )
+from .plot_signals import shared_unit
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines
 

@@ -190,7 +190,7 @@ def _get_list_path(channels: Ros2Channels, entity: str) -> str:
     Args:
         channels: Standard channels by topic.
         entity: Topic of an array, or the topic of joint states and the name of one of their
-            lists, as `rerun_viewer.PlotCurves` has it.
+            lists, as `rerun_viewer._PlotCurves` has it.
     """
     if entity in channels:
         return f"{entity}.data"

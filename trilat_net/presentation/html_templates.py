@@ -58,7 +58,7 @@ def _make_environment() -> Environment:
     )
     environment.globals["zip"] = zip
     environment.filters["code"] = _mark_code
-    environment.filters["hashes"] = mark_hashes
+    environment.filters["hashes"] = _mark_hashes
     # JSON has no NaN and no infinity. Texts are written as they are, not as escape sequences.
     dump = partial(json.dumps, allow_nan=False, ensure_ascii=False)
     environment.policies["json.dumps_function"] = dump
@@ -66,7 +66,7 @@ def _make_environment() -> Environment:
     return environment
 
 
-def mark_hashes(text: str) -> Markup:
+def _mark_hashes(text: str) -> Markup:
     """Converts plain text to HTML, and keeps each hash on a single line.
 
     A hash is a long hexadecimal number that identifies a file. Without a line break, a user can

@@ -45,7 +45,7 @@ from .page_certificate import render_certificate
 from .page_charts import render_chart_groups, render_overview
 from .page_html import render_section
 from .page_links import render_links
-from .page_origin import render_origin, summarise_origin
+from .page_origin import describe_changes, render_origin, summarise_origin
 from .page_sites import render_loops, render_sites
 from .page_summary import render_alarms, render_checks, render_key_numbers, render_verdict
 from .page_timeline import render_timeline
@@ -134,6 +134,7 @@ def render_report(
         name=scenario.name,
         title=scenario.title or scenario.name,
         origin_line=summarise_origin(log),
+        changes=describe_changes(scenario),
         verdict=verdict,
         alarms=render_alarms(log),
         checks=render_checks(verdicts, facts),

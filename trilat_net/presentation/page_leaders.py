@@ -37,7 +37,7 @@ _SAME_SHARE = 1e-9
 """Largest difference of two factors that count as equal."""
 
 
-class Lead(NamedTuple):
+class _Lead(NamedTuple):
     """Who leads a slave over time.
 
     Attributes:
@@ -75,7 +75,7 @@ def caption_site(scenario: Scenario, site: str) -> str:
     return f"{site}, {_name_role(scenario, site)}"
 
 
-def trace_leads(log: Log) -> list[Lead]:
+def trace_leads(log: Log) -> list[_Lead]:
     """Traces with which weights each slave follows its peers.
 
     Args:
@@ -93,7 +93,7 @@ def trace_leads(log: Log) -> list[Lead]:
     return leads[:_MAX_BARS]
 
 
-def _trace_lead(log: Log, slave: str) -> Lead:
+def _trace_lead(log: Log, slave: str) -> _Lead:
     """Traces the dominance factors of a slave, at the points at which their slopes change."""
     end_s = recorded_end_s(log)
     _, ramps = list_ramps(log, slave)
@@ -107,7 +107,7 @@ def _trace_lead(log: Log, slave: str) -> Lead:
     shares = alpha[:, followed]
     kept = _find_corners(t_s, shares)
     peers = [log.scenario.peers(slave)[index] for index in followed]
-    return Lead(slave, peers, t_s[kept], shares[kept])
+    return _Lead(slave, peers, t_s[kept], shares[kept])
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
@@ -118,7 +118,7 @@ def _find_corners(t_s: Array, shares: Array) -> list[int]:
     return [0, *corners.tolist(), len(t_s) - 1]
 
 
-def list_lead_bars(leads: Sequence[Lead]) -> list[LeadBar]:
+def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
     """Returns the data with which the page writes who leads at the time of the slider.
 
     Args:
@@ -137,7 +137,7 @@ def list_lead_bars(leads: Sequence[Lead]) -> list[LeadBar]:
     return bars
 
 
-def render_lead_bars(log: Log, leads: Sequence[Lead]) -> Markup:
+def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
     """Renders a bar for each slave whose dominance factors change.
 
     Args:
@@ -147,7 +147,7 @@ def render_lead_bars(log: Log, leads: Sequence[Lead]) -> Markup:
     return Markup().join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
 
 
-def describe_leads(log: Log, leads: Sequence[Lead]) -> list[str]:
+def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
     """Returns a sentence for each slave whose dominance factors never change.
 
     Args:
@@ -157,7 +157,7 @@ def describe_leads(log: Log, leads: Sequence[Lead]) -> list[str]:
     return [_describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
 
 
-def _describe_constant_lead(scenario: Scenario, lead: Lead) -> str:
+def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
     """Returns a sentence about factors that never change: who leads, with which percentages.
 
     Args:
@@ -174,7 +174,7 @@ def _describe_constant_lead(scenario: Scenario, lead: Lead) -> str:
     return f"{join_words(texts)}, during the whole run."
 
 
-def describe_phases(lead: Lead) -> str:
+def describe_phases(lead: _Lead) -> str:
     """Returns who leads when, as in "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
 
     Ramps between two spans are left out, because the spans around them say how they begin and
@@ -204,7 +204,7 @@ def describe_phases(lead: Lead) -> str:
     return "; ".join(phases)
 
 
-def _render_bar(log: Log, lead: Lead) -> Markup:
+def _render_bar(log: Log, lead: _Lead) -> Markup:
     """Returns the bar of a slave: an area for each peer, with its share as the height."""
     end_s = recorded_end_s(log)
     tops = 1.0 - np.cumsum(lead.shares, axis=1)
@@ -231,7 +231,7 @@ def _list_points(t_s: Array, heights: Array) -> list[str]:
     return [f"{time_s:.6g},{height:.4f}" for time_s, height in points]
 
 
-def _list_shares(lead: Lead, index: int) -> str:
+def _list_shares(lead: _Lead, index: int) -> str:
     """Returns the percentages of all peers at a point, as in "m1 90 %, m2 10 %"."""
     shares = zip(lead.peers, lead.shares[index], strict=True)
     return ", ".join(f"{peer} {_format_percent(share)}" for peer, share in shares)

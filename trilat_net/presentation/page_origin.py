@@ -12,11 +12,12 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from ..errors import count_nouns
 from ..log.accounting import describe_unknown_ends
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
-from ..scenario.describe import list_arm_notes
+from ..scenario.describe import compare_scenarios, list_arm_notes
 from .html_templates import render_macro
 from .page_html import (
     render_code,
@@ -26,6 +27,11 @@ from .page_html import (
     render_section,
 )
 from .page_timeline import describe_dominance
+
+_STATED_KEYS = ("seed", "duration_s")
+"""Settings that stand beside the title anyway."""
+_MAX_CHANGES = 3
+"""Largest number of changed settings in the head of the page."""
 
 
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
@@ -62,6 +68,38 @@ def summarise_origin(log: Log) -> str:
     driver = _describe_driver(log)
     length = f"{scenario.duration_s:g} s"
     return f"{scenario.name} · {length} · {driver} · seed {scenario.seed}"
+
+
+def describe_changes(scenario: Scenario) -> str:
+    """Returns how a scenario differs from the shipped scenario whose name and title it has.
+
+    The title and the description of a scenario state its original settings. A run with other
+    settings, for example of `trilat rerun`, keeps both, so that a reader must be told.
+
+    Args:
+        scenario: Scenario of the run.
+
+    Returns:
+        A phrase such as "every link: constant 800 ms instead of constant 400 ms". Empty if the
+        scenario has no such difference, or if no shipped scenario has its name.
+    """
+    if scenario.name not in list_shipped():
+        return ""
+    shipped = load_scenario(scenario.name)
+    if shipped.title != scenario.title:
+        return ""
+    differences = [
+        difference
+        for difference in compare_scenarios([shipped, scenario])
+        if difference.key not in _STATED_KEYS
+    ]
+    phrases = []
+    for difference in differences[:_MAX_CHANGES]:
+        before, now = difference.values
+        phrases.append(f"{difference}: {now} instead of {before}")
+    if len(differences) > _MAX_CHANGES:
+        phrases.append(f"and {count_nouns(len(differences) - _MAX_CHANGES, 'more setting')}")
+    return "; ".join(phrases)
 
 
 def _render_description(scenario: Scenario) -> Markup:

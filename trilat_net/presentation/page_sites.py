@@ -9,7 +9,6 @@ Invariant:
 
 from markupsafe import Markup
 
-from ..analysis.site_signals import shared_unit
 from ..errors import count_nouns
 from ..log.log_reader import Log
 from ..results import JsonObject
@@ -25,6 +24,7 @@ from .page_html import (
     render_section,
     render_table,
 )
+from .plot_signals import shared_unit
 
 # Keys of a site in the summary, in the order of the columns of its table.
 _MOTION_KEYS = (

@@ -19,13 +19,14 @@ import numpy as np
 from markupsafe import Markup
 
 from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.metrics.motion_metrics import measure_undelayed_error
 from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
+from ..analysis.run_view import RunView
 from ..analysis.site_signals import (
     SETTLED_ERROR_RAD,
     JointError,
     find_error_of_last_second,
     find_largest_error,
-    shared_unit,
 )
 from ..analysis.timeline import list_alarms
 from ..errors import count_nouns, join_words
@@ -36,6 +37,7 @@ from ..scenario.expect import END_WINDOW_S
 from .certificate_text import describe_pace
 from .html_templates import render_macro
 from .page_html import NO_NUMBER, format_cell, render_details
+from .plot_signals import shared_unit
 from .style import typeset
 
 _MAX_ALARMS = 8
@@ -158,6 +160,8 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     has_converged = end.behaviour is EndBehaviour.CONVERGED
     if has_converged and remains:
         clause = "the arms were at rest, with errors that stay"
+    elif is_stable and end.behaviour is EndBehaviour.UNDECIDED:
+        clause = "the motion showed no trend yet, which the evidence above does not need"
     else:
         clause = _ENDS[end.behaviour]
     text = f"At the end of the record, {clause}."
@@ -250,6 +254,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
     cards = []
     if slaves:
         cards.append(_describe_errors(log, slaves, "from where the masters lead"))
+        cards += _describe_undelayed_error(log, slaves)
     if masters:
         cards.append(_describe_errors(log, masters, "from the others"))
     return cards
@@ -278,6 +283,31 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
         if last.site in _list_pushed_sites(log):
             detail += ", which a hand or a wall still pushes"
     return _KeyNumber(f"{join_words(sites)} {place}", f"{peak.value:.3g} {unit}", detail)
+
+
+def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumber]:
+    """Returns the largest distance of the slaves from where the others were at the same time.
+
+    The error compares a slave with what its peers sent some time ago. A reader who sees the
+    arms apart on the screen looks for the distance at the same time.
+
+    Args:
+        log: Log of the run.
+        slaves: Names of the slaves.
+
+    Returns:
+        The number in a list. Empty if the distance is unknown.
+    """
+    view = RunView(log)
+    unit = "rad" if shared_unit(log) == "rad" else "m"
+    errors = [
+        measure_undelayed_error(view, slave)[f"undelayed_max_{unit}"].value for slave in slaves
+    ]
+    known = [error for error in errors if error is not None]
+    if not known:
+        return []
+    name = f"{join_words(slaves)} from where the masters are"
+    return [_KeyNumber(name, f"{max(known):.3g} {unit}", "largest, with the delay included")]
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:

@@ -17,7 +17,6 @@ import numpy as np
 from markupsafe import Markup
 
 from ..analysis.aligned import Bools
-from ..analysis.site_signals import shared_unit, sites_with_operator
 from ..analysis.timeline import (
     find_mode_intervals,
     list_alarms,
@@ -31,6 +30,7 @@ from ..scenario import Scenario
 from .html_templates import render_macro
 from .page_html import render_details, render_section
 from .page_summary import find_error_peak
+from .plot_signals import shared_unit, sites_with_operator
 from .style import typeset
 
 MAX_SHOWN = 5
@@ -54,7 +54,7 @@ _DID = {
 """What a site did in each mode, in the past tense. Other modes have the words of records."""
 
 
-class RunMoment(NamedTuple):
+class _RunMoment(NamedTuple):
     """Something that happened in a run, at a time.
 
     Attributes:
@@ -91,7 +91,7 @@ def render_timeline(log: Log, facts: JsonObject) -> Markup:
     return render_section("What happened", intro, body, "moments")
 
 
-def _render_moments(log: Log, moments: list[RunMoment]) -> Markup:
+def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
     """Returns moments as a list with a time, a number and a sentence each."""
     rows = []
     for moment in moments:
@@ -102,7 +102,7 @@ def _render_moments(log: Log, moments: list[RunMoment]) -> Markup:
     return render_macro("timeline.html", "moments", moments=rows)
 
 
-def list_moments(log: Log, facts: JsonObject) -> list[RunMoment]:
+def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
     """Lists what happened in a run, in the order of time.
 
     Args:
@@ -110,12 +110,13 @@ def list_moments(log: Log, facts: JsonObject) -> list[RunMoment]:
         facts: Numbers of the run, from `summarise_run`.
     """
     moments = [
-        RunMoment(0.0, f"The run starts; {describe_dominance(log.scenario)}."),
+        _RunMoment(0.0, f"The run starts; {describe_dominance(log.scenario)}."),
         *_list_changes(log, facts),
         *_list_pushes(log),
         *_list_modes(log),
+        *_list_hands(log),
         *_list_errors(log, facts),
-        RunMoment(recorded_end_s(log), "The record ends."),
+        _RunMoment(recorded_end_s(log), "The record ends."),
     ]
     return sorted(moments, key=lambda moment: moment.t_s)
 
@@ -136,7 +137,19 @@ def describe_dominance(scenario: Scenario) -> str:
     return "; ".join(sentences)
 
 
-def _list_changes(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
+def _list_hands(log: Log) -> Iterator[_RunMoment]:
+    """Yields when people and programs took hold of arms or let go, and which ones failed."""
+    for event in log.events:
+        if event.kind == "hand":
+            yield _RunMoment(
+                max(event.t_ns, 0) * 1e-9,
+                f"{event.text}.",
+                event.member,
+                is_bad=event.text in log.failed_hands,
+            )
+
+
+def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
     """Yields the changes of the run, numbered as in the charts."""
     for number, change in enumerate(facts["changes"], 1):
         tick = change["taken_at_tick"]
@@ -150,10 +163,10 @@ def _list_changes(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
         if subject not in log.sites:
             sentence = f"{sentence[:1].upper()}{sentence[1:]}"
         text = f"{sentence} ({origin})."
-        yield RunMoment(change["at_s"], text, change["site"], number)
+        yield _RunMoment(change["at_s"], text, change["site"], number)
 
 
-def _list_pushes(log: Log) -> Iterator[RunMoment]:
+def _list_pushes(log: Log) -> Iterator[_RunMoment]:
     """Yields when hands, walls or bodies pushed the arm of each site, and how strongly."""
     for site in sites_with_operator(log):
         records = log[site]
@@ -167,14 +180,14 @@ def _list_pushes(log: Log) -> Iterator[RunMoment]:
         last_s = spans[-1][1]
         if len(spans) > _MAX_PUSHES:
             times = f"{len(spans)} times until {last_s:.3f} s"
-            yield RunMoment(first_s, f"{subject} pushes {site} {times}, {largest}.", site)
+            yield _RunMoment(first_s, f"{subject} pushes {site} {times}, {largest}.", site)
             continue
         for start_s, end_s in spans:
             inside = (records.t_s >= start_s) & (records.t_s <= end_s)
             largest = f"with at most {torques[inside].max():.3g} N m"
             until = "to the end" if end_s >= records.t_s[-1] else f"until {end_s:.3f} s"
             text = f"{subject} pushes {site} {until}, {largest}."
-            yield RunMoment(start_s, text, site)
+            yield _RunMoment(start_s, text, site)
 
 
 def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
@@ -205,7 +218,7 @@ def _name_pusher(log: Log, site: str) -> str:
     return "An operator" if spec.hands else "Something"
 
 
-def _list_modes(log: Log) -> Iterator[RunMoment]:
+def _list_modes(log: Log) -> Iterator[_RunMoment]:
     """Yields when sites did not follow their peers, with the reason if there was an alarm."""
     reasons = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
     end_s = recorded_end_s(log)
@@ -224,10 +237,10 @@ def _list_modes(log: Log) -> Iterator[RunMoment]:
     for (from_s, text), names in sites.items():
         site = names[0] if len(names) == 1 else ""
         sentence = f"{join_words(names)} {text}."
-        yield RunMoment(from_s, sentence, site, is_bad=(from_s, text) in bad_sites)
+        yield _RunMoment(from_s, sentence, site, is_bad=(from_s, text) in bad_sites)
 
 
-def _list_errors(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
+def _list_errors(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
     """Yields the largest error, when all errors became small, and when a site diverged."""
     unit = shared_unit(log)
     peak = find_error_peak(log)
@@ -236,12 +249,12 @@ def _list_errors(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
         text = (
             f"{peak.site} has the largest error of the run, {peak.value:.3g} {unit} at {joint}."
         )
-        yield RunMoment(peak.t_s, text, peak.site)
+        yield _RunMoment(peak.t_s, text, peak.site)
     if facts["settle_s"]:
         limit = f"{facts['settle_below_rad']:g} {unit}"
-        yield RunMoment(facts["settle_s"], f"From here on, every |e| stays below {limit}.")
+        yield _RunMoment(facts["settle_s"], f"From here on, every |e| stays below {limit}.")
     for name, site in facts["sites"].items():
         diverged_s = site["diverged_at_s"]
         if diverged_s is not None:
             text = f"{name} diverged: {log.describe_divergence(name)}."
-            yield RunMoment(diverged_s, text, name, is_bad=True)
+            yield _RunMoment(diverged_s, text, name, is_bad=True)

@@ -26,7 +26,7 @@ _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
 """Kind of exported actions that an operator of each mode accepts as commands."""
 
 
-def find_plugin_hand(log: Log, site: str) -> LiveHand:
+def _find_plugin_hand(log: Log, site: str) -> LiveHand:
     """Returns the operator through which the plugin moves the arm of a site.
 
     Args:
@@ -56,7 +56,7 @@ def find_plugin_actions(log: Log, site: str) -> str:
     Raises:
         UsageError: The operator of the site is commanded by forces, which are not exported.
     """
-    mode = find_plugin_hand(log, site).mode
+    mode = _find_plugin_hand(log, site).mode
     if mode not in _HAND_ACTIONS:
         raise UsageError(
             f"{log.source}: the operator of {site} is commanded by forces, which are not "
@@ -82,7 +82,7 @@ def observe_as_plugin(
     Raises:
         UsageError: The scenario has no operator for the plugin at this site.
     """
-    hand = find_plugin_hand(log, site)
+    hand = _find_plugin_hand(log, site)
     values: list[Array] = []
     names: list[str] = []
     for observed_site in (slave, site):

@@ -198,7 +198,7 @@ _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 """Names, the last parts of topics, of the channels of a session instead of a site."""
 
 
-class PlotCurves(NamedTuple):
+class _PlotCurves(NamedTuple):
     """The curves that show the numbers of one channel in a plot.
 
     A channel is a series of messages with a topic.
@@ -223,7 +223,7 @@ class CurvePlot(NamedTuple):
     """
 
     title: str
-    curves: tuple[PlotCurves, ...]
+    curves: tuple[_PlotCurves, ...]
 
 
 PlotPage = list[list[CurvePlot]]
@@ -383,7 +383,7 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
     return plots
 
 
-def _select_curves(topic: str, field: str, channel: Ros2Channel) -> PlotCurves | None:
+def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves | None:
     """Returns the curves of a channel that belong to a quantity.
 
     Args:
@@ -405,7 +405,7 @@ def _select_curves(topic: str, field: str, channel: Ros2Channel) -> PlotCurves |
     if channel_name == "tau_x":
         # This quantity shares a plot with the torque of the same joints.
         names = [f"tau_x {name}" for name in names]
-    return PlotCurves(topic, tuple(names), (True,) * len(names))
+    return _PlotCurves(topic, tuple(names), (True,) * len(names))
 
 
 def _name_curves(channel: Ros2Channel) -> list[str]:
@@ -418,7 +418,7 @@ def _name_curves(channel: Ros2Channel) -> list[str]:
     return [" ".join(filter(None, parts)) for parts in product(*axes)]
 
 
-def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> PlotCurves | None:
+def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> _PlotCurves | None:
     """Returns the curves of the estimates of one kind of inertial parameter.
 
     Args:
@@ -437,10 +437,10 @@ def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> PlotCurves
         visible.append(parameter_kind == kind)
     if not any(visible):
         return None
-    return PlotCurves(topic, tuple(names), tuple(visible))
+    return _PlotCurves(topic, tuple(names), tuple(visible))
 
 
-def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> PlotCurves | None:
+def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> _PlotCurves | None:
     """Returns the curves of the positions, velocities or torques of joints.
 
     The messages of a channel contain the states of the joints, those of the reference that the
@@ -467,7 +467,7 @@ def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> PlotCu
         names = [name.removesuffix(suffix) + suffix for name in names]
     shows_references = is_only_reference or field == "position"
     visible = [shows_references or not name.endswith(suffix) for name in names]
-    return PlotCurves(f"{topic}/{field}", tuple(names), tuple(visible))
+    return _PlotCurves(f"{topic}/{field}", tuple(names), tuple(visible))
 
 
 _COLORS = [
@@ -542,7 +542,7 @@ def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
     )
 
 
-def _style_curves(curves: PlotCurves, first_color: int) -> Any:
+def _style_curves(curves: _PlotCurves, first_color: int) -> Any:
     """Returns the names and the colors of curves. References have pale colors.
 
     Args:

@@ -35,7 +35,6 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ..analysis.site_signals import decimate
 from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
 from ..core.step.ticks import Mode
 from ..core.step.vectors import Array
@@ -45,6 +44,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario.arms import TASK_AXES
 from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
+from .plot_signals import decimate
 
 AxesGrid = NDArray[np.object_]
 """Panels of a figure, shape (rows, columns), of `Axes`."""
@@ -112,10 +112,10 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
     if form.narrow:
         settings.update(_NARROW_RC)
     with mpl.rc_context(settings):
-        yield NotebookFigure(figsize=(form.width_in, height_in), layout="constrained")
+        yield _NotebookFigure(figsize=(form.width_in, height_in), layout="constrained")
 
 
-class NotebookFigure(Figure):
+class _NotebookFigure(Figure):
     """A Matplotlib figure that a Jupyter notebook displays as a picture.
 
     A plain Matplotlib figure that was made without pyplot would be displayed as its size in
@@ -365,7 +365,7 @@ def flatten_rounding(axes: Axes) -> None:
         axes.set_ylim(low - 0.05, high + 0.05)
 
 
-class JointPanels(NamedTuple):
+class _JointPanels(NamedTuple):
     """Panels of a figure that shows each joint in a panel of its own.
 
     `add_joint_panels` creates and arranges them.
@@ -417,7 +417,7 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
 
 def add_joint_panels(
     figure: Figure, joints: int, form: FigureSize, below: str = ""
-) -> JointPanels:
+) -> _JointPanels:
     """Adds a panel per joint to a figure, and optionally a wide panel below them.
 
     Two joints share their value axis. More joints have an axis each, because the torques of
@@ -444,7 +444,7 @@ def add_joint_panels(
     if joints == 2:
         joint_panels[1].sharey(joint_panels[0])
         joint_panels[1].tick_params(labelleft=False)
-    return JointPanels(
+    return _JointPanels(
         joints=joint_panels,
         columns=columns,
         lowest=joint_panels[-columns:],

@@ -34,11 +34,12 @@ from ..core.arms.chain import (
     place_joints,
 )
 from ..core.arms.rotation import relative_rotation, rotation_matrix
-from ..core.arms.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
+from ..core.arms.two_link_arm import ArmLinks, theta_from_links
 from ..core.life.live_hand import HandReach
 from ..core.step.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
 from ..core.step.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError, count_nouns
+from .key_checks import VectorCounts, field_names
 from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf
 
@@ -156,7 +157,7 @@ def start_margin(joint: ChainJoint) -> float:
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
 """Keys of an arm that place its base in space."""
-CHAIN_KEYS = fields.field_names(Arm)[fields.field_names(Arm).index("base") :]
+CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 """Keys of an arm that only a chain has."""
 
 
@@ -264,7 +265,7 @@ class ArmModel(NamedTuple):
     """
 
     theta: Array
-    counts: fields.VectorCounts
+    counts: VectorCounts
     joint_names: tuple[str, ...]
     link_names: tuple[str, ...]
     efforts: tuple[float, ...]
@@ -486,6 +487,32 @@ class ArmModel(NamedTuple):
         return M
 
 
+def _is_positive_definite(theta: Array) -> bool:
+    """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
+
+    Otherwise the parameters describe no real arm. With the angle q2 of the second joint, the
+    inertia matrix is
+
+        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
+            | theta_3 + theta_2 cos(q2)      theta_3                   |
+
+        det M = theta_1 theta_3 - theta_3^2 - theta_2^2 cos(q2)^2
+
+    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked. The
+    check has a margin for rounding.
+
+    Args:
+        theta: Dynamic parameters of the arm, shape (5,), see `theta_from_links`. The first
+            three are inertias, kg m^2.
+    """
+    theta_1 = theta[0]
+    theta_2 = theta[1]
+    theta_3 = theta[2]
+    least_determinant = theta_1 * theta_3 - theta_3**2 - theta_2**2
+    margin = 1e-9 * theta_1 * theta_3
+    return bool(theta_3 > 0.0 and least_determinant > margin)
+
+
 def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool) -> ArmModel:
     """Converts the table of an arm in a scenario to a model for computation.
 
@@ -503,17 +530,17 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
     if arm.urdf:
         return _build_chain_model(arm, task, read_arm(arm, urdf_texts))
     theta = theta_from_links(arm.planar_links())
-    if not is_positive_definite(theta):
+    if not _is_positive_definite(theta):
         raise ScenarioError(
             "the inertia matrix is singular in some pose: give the links mass away from their "
             "joints"
         )
-    counts = fields.VectorCounts()
+    counts = VectorCounts()
     lengths_m = (arm.l1_m, arm.l2_m)
     chain = None
     if chains:
         theta = _list_planar_bodies(arm)
-        counts = fields.VectorCounts.of_chain(2, task.shared)
+        counts = VectorCounts.of_chain(2, task.shared)
         lengths_m = (0.0, 0.0)
         chain = _build_planar_chain(arm, task)
     return ArmModel(
@@ -679,7 +706,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
     joints, gravity = _place_base(arm, joints, (scale * x, scale * y, scale * z))
     return ArmModel(
         theta=np.concatenate([joint.inertia for joint in urdf_chain.joints]),
-        counts=fields.VectorCounts.of_chain(joint_count, task.shared),
+        counts=VectorCounts.of_chain(joint_count, task.shared),
         joint_names=tuple(joint.name for joint in urdf_chain.joints),
         link_names=tuple(joint.link for joint in urdf_chain.joints),
         efforts=tuple(joint.effort_limit for joint in urdf_chain.joints),

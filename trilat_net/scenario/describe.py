@@ -30,8 +30,6 @@ from ..laws.conditions import ArmLoad, LawSituation, StabilityCondition
 from ..laws.interface import LawSettings
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
-from .delay_period import find_final_link
-from .imported_code import ImportedLaw
 from .operators.kernel_operators import (
     Chirp,
     JointSpring,
@@ -148,7 +146,7 @@ _TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
 """Operators whose torque depends on time alone."""
 
 
-def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
+def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
     """Yields each site, its control law, and the facts on which its stability depends."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
@@ -183,7 +181,7 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
         scenario: Description of the experiment.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
-    for name, law, situation in _list_situations(scenario):
+    for name, law, situation in list_law_situations(scenario):
         condition = law.condition(situation)
         if condition:
             owners.setdefault((law.tag, condition), []).append(name)
@@ -195,53 +193,6 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
     ]
 
 
-def list_law_proofs(scenario: Scenario) -> list[str]:
-    """Lists the stability conditions of control laws that prove that all motions die away.
-
-    They are evaluated for the delays and dominance factors (the weights with which arms follow
-    each other) at the end of the scenario.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        A phrase per condition. Empty unless the condition of every site holds and proves it.
-    """
-    if any(change.dominance for change in scenario.timeline):
-        return []
-    links = {name: find_final_link(scenario, name) for name in scenario.links}
-    final = msgspec.structs.replace(scenario, links=links, timeline=())
-    proofs = []
-    for _, law, situation in _list_situations(final):
-        condition = law.condition(situation)
-        if condition is None or not condition.proves_decay:
-            return []
-        proofs.append(f"the condition of {law.tag}: {condition.text}")
-    return list(dict.fromkeys(proofs))
-
-
-def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that declare energies, by site.
-
-    Args:
-        scenario: Scenario of the run.
-        own_laws: True to also create laws that are not part of this program, which runs their
-            code.
-
-    Raises:
-        ScenarioError: The file of a law that is not part of this program is missing.
-    """
-    laws: dict[str, Any] = {}
-    for site, spec in scenario.sites.items():
-        setup = scenario.setup(site)
-        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
-        if setup.law_factory is not None and is_allowed:
-            law = setup.law_factory(setup.law_context())
-            if callable(getattr(law, "energies", None)):
-                laws[site] = law
-    return laws
-
-
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
     """Returns lines about sites whose dominance factors have no effect.
 
@@ -249,7 +200,7 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
-    for name, law, situation in _list_situations(scenario):
+    for name, law, situation in list_law_situations(scenario):
         reason = law.explain_idle_shares(situation)
         if not reason and name in ramped_sites and law.fixed_shares:
             reason = (

@@ -23,7 +23,8 @@ from msgspec import Meta
 from ..core.arms.chain import MAX_JOINTS
 from ..core.links.philox import link_key
 from ..errors import ScenarioError
-from ..fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
+from ..fields import Frozen, NotNegative, Real, TomlTable
+from .key_checks import is_distribution, is_number
 
 _MAX_LIST_LENGTH = 64
 """Longest list in which numbers are drawn. Longer lists are recorded tables."""

@@ -22,16 +22,8 @@ from msgspec import Meta
 
 from ..core.arms.chain import MAX_JOINTS
 from ..errors import ScenarioError, count_nouns, suggest_nearest
-from ..fields import (
-    Joints,
-    KeyProblem,
-    NotNegative,
-    Positive,
-    Real,
-    TomlTable,
-    check_keys,
-    field_names,
-)
+from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, TomlTable
+from .key_checks import check_keys, field_names
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 LeastMost = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]

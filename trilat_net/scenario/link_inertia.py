@@ -21,6 +21,7 @@ from msgspec import Meta
 
 from .. import fields
 from ..core.arms.chain import Matrix
+from .key_checks import field_names
 
 JACOBI_SWEEPS = 12
 """Number of sweeps of Jacobi's method.
@@ -53,7 +54,7 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
 
         The parameters that are not in the list are taken from the URDF file of the arm.
         """
-        keys = fields.field_names(LinkInertia)
+        keys = field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]
 
 

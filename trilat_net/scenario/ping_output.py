@@ -70,7 +70,7 @@ _WINDOWS_BREAK = re.compile(r"\^C|\S+[-+]C")
 _SEVERAL_RUNS = "the output contains several runs of ping: import each run separately"
 
 
-class PingProbes(NamedTuple):
+class _PingProbes(NamedTuple):
     """Round trips that one run of the program `ping` measured, in the order of sending.
 
     Attributes:
@@ -106,7 +106,7 @@ class _Summary(NamedTuple):
     received: int
 
 
-def read_ping(text: str, every_s: float) -> PingProbes:
+def read_ping(text: str, every_s: float) -> _PingProbes:
     """Reads the round trips from the output of one run of `ping` or `fping`.
 
     The program that produced the output is recognised by its lines.
@@ -143,7 +143,7 @@ def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:
     return None if match is None else _Summary(int(match[1]), int(match[2]))
 
 
-def _read_numbered(lines: Sequence[str], every_s: float) -> PingProbes:
+def _read_numbered(lines: Sequence[str], every_s: float) -> _PingProbes:
     """Returns the probes of a program that prints the sequence number of each probe.
 
     A line with a sequence number and a round-trip time is an answer. A line with a sequence
@@ -208,7 +208,7 @@ def _parse_decimal(text: str) -> float:
     return float(text.replace(",", "."))
 
 
-def _read_fping(lines: Sequence[str], every_s: float) -> PingProbes:
+def _read_fping(lines: Sequence[str], every_s: float) -> _PingProbes:
     """Returns the probes in the output of `fping`, whose numbers start from 0 and never wrap.
 
     Args:
@@ -252,7 +252,7 @@ def _arrange_probes(
     first: int | None,
     summary: _Summary | None,
     every_s: float,
-) -> PingProbes:
+) -> _PingProbes:
     """Returns the probes of a run in the order of their numbers, including the lost ones.
 
     Args:
@@ -292,7 +292,7 @@ def _arrange_probes(
 
     numbers = np.arange(begin, end)
     rtt_ms = [answers[n].rtt_ms if n in answers else math.inf for n in numbers.tolist()]
-    return PingProbes(
+    return _PingProbes(
         sent_s=_find_sending_times(numbers, answers, every_s).tolist(),
         rtt_ms=rtt_ms,
         begin_known=first is not None or lowest <= 1,
@@ -341,7 +341,7 @@ def _find_sending_times(
     return np.asarray(interpolated_s + mean_s * (before + after))
 
 
-def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
+def _read_windows(lines: Sequence[str], every_s: float) -> _PingProbes:
     """Returns the probes in the output of Windows, which prints no sequence numbers.
 
     The output has a header that ends in a colon, one line per probe, and then the summary,
@@ -392,7 +392,7 @@ def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
             f"the summary counts {count_nouns(sent, 'packet')}, but there are lines for "
             f"{len(rtt_ms)}"
         )
-    return PingProbes(
+    return _PingProbes(
         sent_s=[n * every_s for n in range(len(rtt_ms))],
         rtt_ms=rtt_ms,
         begin_known=has_header or sent is not None,

@@ -35,9 +35,16 @@ import numpy as np
 from ..core.arms.two_link_arm import ArmLinks
 from ..core.links import dominance
 from ..errors import ScenarioError, count_nouns, suggest_nearest
-from ..fields import (
-    Frozen,
-    TomlTable,
+from ..fields import Frozen, TomlTable, reword_problem, split_refusal
+from ..files import open_regular
+from ..own_code.imported_code import CLASS_PATTERN, read_code
+from ..own_code.sent_channel import parse_classes, read_sends
+from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
+from .delay_models import DELAY_MODELS
+from .delay_traces import read_trace
+from .distributions import Draws
+from .expect import Expect, number_window_joints
+from .key_checks import (
     VectorCounts,
     check_choice,
     check_finite,
@@ -48,17 +55,7 @@ from ..fields import (
     find_count_problem,
     is_distribution,
     is_number,
-    reword_problem,
-    split_refusal,
 )
-from ..files import open_regular
-from ..laws.sent_vectors import parse_classes, read_sends
-from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
-from .delay_models import DELAY_MODELS
-from .delay_traces import read_trace
-from .distributions import Draws
-from .expect import Expect, number_window_joints
-from .imported_code import CLASS_PATTERN, read_code
 from .laws import LAWS
 from .link_inertia import LinkInertia
 from .operators import ENVIRONMENTS, OPERATORS, HeldArm, resolve_operators
@@ -996,6 +993,18 @@ def _complete_link(
     return link
 
 
+def _list_link_paths(written: TomlTable, path: str) -> list[str]:
+    """Returns the paths that the author of the common settings of links may have meant.
+
+    The settings of one link stand in the table `links`, those of all links in the table `link`.
+
+    Args:
+        written: Settings as the author wrote them.
+        path: Path of the settings.
+    """
+    return [f"links.{key}" for key in written if path == "link" and "->" in key]
+
+
 def _resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     """Completes the settings of a link with defaults.
 
@@ -1037,7 +1046,7 @@ def _resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     model_keys = {name: field_names(kind) for name, kind in DELAY_MODELS.items()}
     model_keys["trace"] = (*model_keys["trace"], *TRACE_KEYS)
     _check_kind_keys(written, valid_keys, path, f"model {model}", model_keys)
-    local_table = check_keys(written, valid_keys, path)
+    local_table = check_keys(written, valid_keys, path, _list_link_paths(written, path))
 
     # Delays that are written out replace the file of the defaults, and a file replaces delays.
     replaced_keys: tuple[str, ...] = ()

@@ -40,7 +40,7 @@ _MAX_PATTERNS = 64
 """Largest number of combinations of the joints' directions that are examined."""
 
 
-class RestBounds(NamedTuple):
+class _RestBounds(NamedTuple):
     """Bounds of the motion with which an arm comes to rest after a stop.
 
     The bounds hold for a certain speed of the joints at the beginning of the stop.
@@ -79,7 +79,7 @@ class _ArmSamples(NamedTuple):
     coriolis: Array
 
 
-def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> RestBounds:
+def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> _RestBounds:
     """Computes bounds of the time, energy and speeds with which an arm comes to rest.
 
     Args:
@@ -116,7 +116,7 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
         samples=samples,
         energy_j=energy_j,
     )
-    return RestBounds(
+    return _RestBounds(
         rest_s=rest_s,
         bearable_share=math.sqrt(float(shares.min())),  # (7)
         kinetic_j=kinetic_j,

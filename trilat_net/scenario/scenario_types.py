@@ -37,7 +37,8 @@ from ..core.step.ticks import DominanceRamp
 from ..core.step.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
-from ..laws.sent_vectors import SentVectorSpecs, build_channel
+from ..laws.sent_vectors import SentVectorSpecs
+from ..own_code.sent_channel import build_channel
 from ..recorded_change import RecordedChange
 from ..recorded_change import SiteOrder as SiteOrder
 from ..records import Layout

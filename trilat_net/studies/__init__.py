@@ -1,1 +1,1 @@
-"""Experiments with people, and former places of names of the package trilat-studies."""
+"""Former places of names of the packages trilat-studies and trilat-people."""

@@ -26,10 +26,10 @@ import tomli_w
 
 from ..core.step.fingerprint import compute_fingerprint
 from ..errors import ScenarioError, join_arguments
-from ..fields import is_distribution
 from ..files import describe_write_error, extend_file
 from ..log.provenance import collect_provenance
-from ..scenario.imported_code import name_law_classes
+from ..own_code.imported_code import name_law_classes
+from ..scenario.key_checks import is_distribution
 from .executor import Progress, Together, WorkerPool
 
 
@@ -143,7 +143,7 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
     return stream.getvalue()
 
 
-class JournalEntry(Protocol):
+class _JournalEntry(Protocol):
     """Interface of an entry of a `RunJournal`: the result of a finished run.
 
     An entry is a structure of plain values. The cell and the seed together identify its run.
@@ -163,7 +163,7 @@ class JournalEntry(Protocol):
 
 P = TypeVar("P")
 T = TypeVar("T")
-E = TypeVar("E", bound=JournalEntry)
+E = TypeVar("E", bound=_JournalEntry)
 
 
 class RunJournal(Generic[E]):

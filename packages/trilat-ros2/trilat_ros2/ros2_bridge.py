@@ -86,7 +86,7 @@ JointNames = Sequence[Sequence[str]]
 """For each joint of an arm, the names that it may have in ROS messages."""
 
 
-class SingleSender:
+class _SingleSender:
     """Checks for each message of a topic that only one program publishes on the topic.
 
     Two programs that command the same arm would move it back and forth. The messages of both
@@ -161,7 +161,7 @@ class TargetTopic:
         self._read = read
         self._apply = apply
         self._clock = clock
-        self._sender = SingleSender(clock)
+        self._sender = _SingleSender(clock)
         self._lock = threading.Lock()
         # Time of the newest target; None while the topic does not hold the arm.
         self._received_ns: int | None = None
@@ -233,7 +233,7 @@ class DominanceTopic:
     ) -> None:
         self._peers = peers
         self._change = change
-        self._sender = SingleSender(clock)
+        self._sender = _SingleSender(clock)
         self._requested: dict[str, float] | None = None
         self._sent_request: dict[str, float] | None = None
 
@@ -321,7 +321,7 @@ class RobotArm:
 
         self._commands = commands
         self._clock = clock
-        self._sender = SingleSender(clock)
+        self._sender = _SingleSender(clock)
         self._lock = threading.Lock()
         # Process start (boot) and tick of the record whose torque was published last.
         self._published_tick: tuple[int, int] | None = None
@@ -528,7 +528,7 @@ def read_vector_target(
     return _check_finite(numbers[:axes])
 
 
-class Bridge:
+class _Bridge:
     """Connects one running session with ROS 2.
 
     When the object has been created, ROS programs see its topics and services. `run` then
@@ -940,7 +940,7 @@ def publish_session(
             # A robot whose joints are named needs no scenario, and can start before any site
             # replies.
             if robot.joints:
-                robot_context = open_robot(ends, site, robot)
+                robot_context = _open_robot(ends, site, robot)
                 robots[site] = stack.enter_context(robot_context)
 
         say(f"waiting for session {ends.session!r} to begin")
@@ -953,7 +953,7 @@ def publish_session(
             if site not in robots:
                 robot = ends.table.robots.get(site, RobotTable())
                 names = _list_joint_names(scenario, site)
-                robot_context = open_robot(ends, site, robot, names)
+                robot_context = _open_robot(ends, site, robot, names)
                 robots[site] = stack.enter_context(robot_context)
             robots[site].armed = True
         if robots:
@@ -964,7 +964,7 @@ def publish_session(
         if running_info is None:
             return False
 
-        bridge = Bridge(ends, scenario, running_info.epoch_unix_ns)
+        bridge = _Bridge(ends, scenario, running_info.epoch_unix_ns)
         for target in bridge.targets.values():
             stack.enter_context(target.hand)
         for topic, dominance in bridge.dominance.items():
@@ -995,7 +995,7 @@ def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> No
     write_whole(path, build_rviz_config(topics))
 
 
-def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> list[str]:
+def _describe_inputs(ends: BridgeEnds, bridge: _Bridge, robots: Iterable[str]) -> list[str]:
     """Describes for the user which ROS topics influence the session, and how.
 
     A ROS program can publish target positions for an arm, as the operator of that arm. A robot
@@ -1017,7 +1017,7 @@ def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) ->
 
 
 @contextmanager
-def open_robot(
+def _open_robot(
     ends: BridgeEnds,
     site: str,
     robot: RobotTable,

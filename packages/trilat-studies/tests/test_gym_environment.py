@@ -1,5 +1,7 @@
 """An experiment as a Gymnasium environment: checked by it, a function of its seed, and saved as logs."""
 
+import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -124,6 +126,10 @@ def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> No
         ({"link.delay_ms": (0.0, -300.0)}, "delay_ms: expected a number >= 0.0"),
         ({"seeds": [1, 2]}, "did you mean 'seed'"),
         ({"link.delay_ms": []}, "link.delay_ms needs a pair of bounds or a list"),
+        (
+            {"link.delay_ms": 5},
+            "link.delay_ms needs a pair of bounds or a list of values, not 5",
+        ),
     ],
 )
 def test_varied_keys_are_checked_before_the_first_episode(
@@ -131,6 +137,31 @@ def test_varied_keys_are_checked_before_the_first_episode(
 ) -> None:
     with pytest.raises((ScenarioError, UsageError), match=words):
         tn.make_env("paper", BENT, duration_s=1, vary=vary)
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ({"mode": "velocity"}, "mode must be 'tip', 'joint', 'force' or empty, not 'velocity'"),
+        ({"rate_hz": 0}, "rate_hz must be a whole number of steps per second, not 0"),
+        ({"rate_hz": 2.5}, "rate_hz must be a whole number of steps per second, not 2.5"),
+        ({"delay_ms": -50}, "delay_ms must be a time of at least 0 ms, not -50"),
+        ({"delay_ms": math.nan}, "delay_ms must be a time of at least 0 ms, not nan"),
+        ({"task": "reach"}, "task must have the methods begin and judge, unlike 'reach'"),
+    ],
+)
+def test_arguments_without_meaning_are_refused(argument: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(words)):
+        tn.make_env("paper", BENT, duration_s=1, **argument)
+
+
+def test_info_tells_what_an_episode_drew() -> None:
+    env = tn.make_env("paper", BENT, duration_s=1, vary={"link.delay_ms": (0, 300)})
+    _, info = env.reset(seed=4)
+    assert 0.0 <= info["drawn"]["link.delay_ms"] <= 300.0
+    assert {link.delay_ms for link in env.scenario.links.values()} == {
+        info["drawn"]["link.delay_ms"]
+    }
 
 
 @pytest.mark.parametrize("normalize", [False, True])

@@ -1,11 +1,9 @@
-"""Pages of studies in a browser: maps, the suite, experiments; pictures have colours, tables have cells."""
+"""Pages of studies in a browser: maps and the suite; pictures have colours, tables have cells."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from markdown_it import MarkdownIt
 from playwright.sync_api import Browser
 from sweep_tests.maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 from trilat_studies.bench import plan_bench, prepare_bench_folder, run_bench
@@ -14,68 +12,10 @@ from trilat_studies.sweep.map_page import write_map
 from trilat_studies.sweep.stability_map import MapLine, MapPlane, StabilityMap, build_plane
 from trilat_studies.sweep.sweep_cell import CellClass
 
-import trilat_net
 from tests.live.browsers import needs_browser
-from tests.page.whole_pages import WatchedPage, watched_page
-from tests.studies.experiment.experiments import REACH, write_protocol
+from tests.page.study_pages import assert_markdown_is_whole
 
 pytestmark = needs_browser
-
-ADDRESS = "http://page.test/"
-COLOURED = """(image) => {
-  const canvas = new OffscreenCanvas(image.naturalWidth, image.naturalHeight);
-  const painter = canvas.getContext("2d");
-  painter.drawImage(image, 0, 0);
-  const data = painter.getImageData(0, 0, canvas.width, canvas.height).data;
-  let count = 0;
-  for (let n = 0; n < data.length; n += 4) {
-    const channels = data.subarray(n, n + 3);
-    count += Math.max(...channels) - Math.min(...channels) > 20;
-  }
-  return count;
-}"""
-"""Number of the pixels of a picture that are neither white, black nor grey, as axes and letters are."""
-
-
-def open_folder(watched: WatchedPage, folder: Path, html: str) -> None:
-    """Opens a page whose pictures lie in a folder."""
-
-    def answer(route: Any) -> None:
-        file = folder / route.request.url.removeprefix(ADDRESS)
-        if route.request.url == ADDRESS:
-            route.fulfill(
-                body=f"<!DOCTYPE html><meta charset=utf-8><link rel=icon href=data:,>{html}",
-                content_type="text/html",
-            )
-        elif file.is_file():
-            route.fulfill(path=file)
-        else:
-            route.fulfill(status=404)
-
-    watched.page.route(f"{ADDRESS}**", answer)
-    watched.page.goto(ADDRESS)
-
-
-def assert_page_of_study_is_whole(
-    browser: Browser, folder: Path, html: str, pictures: int, tables: int
-) -> None:
-    """Asserts that a page has so many pictures and at least so many tables, all of them with content."""
-    with watched_page(browser) as watched:
-        open_folder(watched, folder, html)
-        watched.assert_whole()
-        assert watched.page.locator("table").count() >= tables
-        assert watched.page.locator("img").count() == pictures
-        for image in watched.page.locator("img").all():
-            assert image.evaluate(COLOURED) > 100, image.get_attribute("src")
-
-
-def assert_markdown_is_whole(
-    browser: Browser, page: Path, pictures: int, tables: int = 1
-) -> None:
-    """The same of a page in Markdown, as viewers of Markdown show it."""
-    html = MarkdownIt("commonmark").enable("table").render(page.read_text(encoding="utf-8"))
-    assert_page_of_study_is_whole(browser, page.parent, html, pictures, tables)
-
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
 LINE = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
@@ -123,14 +63,3 @@ def test_page_of_the_suite_is_whole(
     without = [] if "contact" in tasks else ["stiffness"]
     page = folder.path / "bench.md"
     assert_markdown_is_whole(browser, page, len(FIGURES_OF_BENCH) - len(without), tables=3)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("users", ['["m1"]', '["m1", "m2"]'], ids=["alone", "pairs"])
-def test_report_of_an_experiment_is_whole(users: str, browser: Browser, tmp_path: Path) -> None:
-    file = write_protocol(tmp_path, users, REACH)
-    folder = trilat_net.run_experiment(file, tmp_path / "out", jobs=1).folder
-    analysis = trilat_net.analyse_experiment(folder)
-    pictures = sum(path.suffix == ".png" for path in analysis.paths)
-    assert_markdown_is_whole(browser, folder / "analysis" / "report.md", pictures)
-    assert_page_of_study_is_whole(browser, folder, analysis._repr_html_(), pictures=0, tables=1)

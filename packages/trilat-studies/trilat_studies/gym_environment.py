@@ -22,7 +22,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args, get_type_hints
 
 import numpy as np
 from msgspec.structs import replace
@@ -40,7 +40,7 @@ from trilat_net.log.orientations import expand_poses
 from trilat_net.scenario import Scenario, find_site, load_scenario
 from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
-from trilat_net.scenario.own_plant import make_plant_players
+from trilat_net.scenario.plant_player import make_plant_players
 
 from .reachable_places import can_reach
 
@@ -239,7 +239,7 @@ class ReachTask:
         return Judgement(reward, succeeded=succeeded)
 
 
-class ActedHand(HandPlayer):
+class _ActedHand(HandPlayer):
     """Simulated operator that moves the user's arm with the actions of a policy.
 
     Args:
@@ -287,8 +287,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         duration_s: Duration of an episode, in s. None keeps the duration of the scenario.
         task: Task of the episodes. By default the site `leads` brings its end effector to a
             random position.
-        vary: Keys of the scenario that each episode draws at random, from a list of values or
-            between a pair of bounds.
+        vary: Keys of the scenario that each episode draws at random. A tuple of two numbers is
+            a pair of bounds, `(0, 300)`; a list has the possible values, `[0, 300]`.
         leads: Site that does the task.
         render_mode: With "rgb_array", `render` returns a picture of the arms and the goal. With
             None, `render` returns None.
@@ -309,6 +309,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     Raises:
         ScenarioError: The scenario or an override is not valid.
         UsageError: There is no such site, the rate is not valid, or Gymnasium is missing.
+            Another argument cannot have its value; the message names both.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
@@ -334,6 +335,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if render_mode not in (None, *render_modes):
             modes = ", ".join(render_modes)
             raise UsageError(f"render_mode must be {modes} or None, not {render_mode!r}")
+        _check_arguments(mode=mode, rate_hz=rate_hz, delay_ms=delay_ms, task=task)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._picture: EpisodePicture | None = None
@@ -475,7 +477,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             UsageError: A key has no values.
         """
         for key, values in self._vary.items():
-            if isinstance(values, str) or not len(values):
+            if isinstance(values, str) or not isinstance(values, Sequence) or not len(values):
                 raise UsageError(
                     f"vary: {key} needs a pair of bounds or a list of values, not {values!r}"
                 )
@@ -533,7 +535,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._actions = list[Array]()
         self._clipped_actions = 0
         hand_site = self._build_hand_site(scenario)
-        self._player = ActedHand(hand_site, self._actions)
+        self._player = _ActedHand(hand_site, self._actions)
         self._plants = make_plant_players(scenario)  # users' programs that move arms, by site
         hands = {self._user: self._player}
         ticks = [scenario.ticks(name) for name in scenario.names]
@@ -689,7 +691,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             options: Overrides for this episode only, as in {"link.delay_ms": 200}.
 
         Returns:
-            The first observation, and the information dictionary.
+            The first observation, and the information dictionary. Its key "drawn" has the
+            settings of this episode.
 
         Raises:
             ScenarioError: The options or the drawn values are not valid.
@@ -710,6 +713,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._runs = True
         observation = self._format_observation(scene)
         info = self._describe_step(scene, succeeded=False)
+        info["drawn"] = overrides
         return observation, info
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -834,7 +838,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not self._actions:
             raise UsageError("an episode has no log before its first step")
         hand_site = self._build_hand_site(self.scenario)
-        player = ActedHand(hand_site, self._actions)
+        player = _ActedHand(hand_site, self._actions)
         hands = {self._user: player.track}
         elapsed_s = self._k / self._tick_rate_hz
         scenario = replace(self.scenario, duration_s=elapsed_s)
@@ -877,6 +881,32 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
             subscripts = [f"[{index}]" for index in indices]
             names.append(part + "".join(subscripts))
     return names
+
+
+def _check_arguments(
+    *, mode: str, rate_hz: int, delay_ms: float, task: EpisodeTask | None
+) -> None:
+    """Refuses arguments of an environment that can have no meaning.
+
+    Args:
+        mode: Meaning of an action.
+        rate_hz: Number of steps per second.
+        delay_ms: Time from an observation until its action takes effect, in ms.
+        task: Task of the episodes. None for the default.
+
+    Raises:
+        UsageError: An argument is not valid. The message names its value and the valid ones.
+    """
+    modes = get_args(get_type_hints(LiveHand)["mode"])
+    if mode not in ("", *modes):
+        choices = ", ".join(map(repr, modes))
+        raise UsageError(f"mode must be {choices} or empty, not {mode!r}")
+    if isinstance(rate_hz, bool) or not isinstance(rate_hz, int) or rate_hz < 1:
+        raise UsageError(f"rate_hz must be a whole number of steps per second, not {rate_hz!r}")
+    if isinstance(delay_ms, str) or not 0.0 <= delay_ms < math.inf:
+        raise UsageError(f"delay_ms must be a time of at least 0 ms, not {delay_ms!r}")
+    if task is not None and not (hasattr(task, "begin") and hasattr(task, "judge")):
+        raise UsageError(f"task must have the methods begin and judge, unlike {task!r}")
 
 
 def _draw(random: np.random.Generator, values: Sequence[Any]) -> Any:

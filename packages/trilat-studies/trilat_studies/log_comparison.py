@@ -10,22 +10,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.metrics.log_metrics import (
-    ComparisonRow,
-    MetricComparison,
-    compare_metrics,
-    comparison_to_json,
-)
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.measures import Metric, Quantity, quantities
 from trilat_net.errors import UsageError, count_nouns, join_words
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.own_code.code_consent import may_run_user_laws
 from trilat_net.presentation.certificate_text import describe_judgement
 from trilat_net.presentation.result_text import Block, MarkedText, TextTable, format_number
 from trilat_net.results import Result
-from trilat_net.scenario.code_consent import may_run_user_laws
-from trilat_net.scenario.describe import ScenarioDifference, compare_scenarios
+from trilat_net.scenario.describe import (
+    ScenarioDifference,
+    compare_scenarios,
+)
 from trilat_net.scenario.scenario_reader import reseed_scenario
 from trilat_net.work.intervals import MeanInterval, mean_interval
 
@@ -44,6 +43,93 @@ _SUBJECTS = {
 """How the number of a run follows from those of its sites, links or walls, by `reduction`."""
 
 
+class _ComparisonRow(NamedTuple):
+    """One quantity in several runs, as a row of a table.
+
+    Attributes:
+        quantity: The quantity.
+        entries: The metric of the quantity in each run, in the order of the columns.
+    """
+
+    quantity: Quantity
+    entries: tuple[Metric, ...]
+
+    @property
+    def values(self) -> tuple[float | None, ...]:
+        """The value of the quantity in each of the compared runs. None where it is missing."""
+        return tuple(entry.value for entry in self.entries)
+
+
+class _MetricComparison(NamedTuple):
+    """Metrics of several runs, side by side, as a table.
+
+    Attributes:
+        columns: Names of the runs.
+        rows: All quantities that apply to at least one of the runs, in the order in which they
+            are shown.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[_ComparisonRow, ...]
+
+    def row(self, key: str) -> _ComparisonRow:
+        """Returns the row of this comparison that shows a quantity in all logs.
+
+        Args:
+            key: Key of the quantity, such as "sharing_off".
+
+        Raises:
+            KeyError: No row has this key.
+        """
+        row_by_key = {row.quantity.key: row for row in self.rows}
+        return row_by_key[key]
+
+
+def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricComparison:
+    """Computes the metrics of several logs, so that they can be shown in one table.
+
+    Args:
+        logs: The logs, which may be torn, short or empty.
+        names: Names of the columns. By default the names of the logs' files.
+
+    Raises:
+        LogError: A record cannot be read, or names a change that is not valid.
+    """
+    measured = [compute_log_metrics(log) for log in logs]
+    rows = []
+    for quantity in quantities():
+        entries = tuple(metrics.run_value(quantity) for metrics in measured)
+        if any(entry.applies for entry in entries):
+            rows.append(_ComparisonRow(quantity, entries))
+    columns = list(names)
+    if not columns:
+        columns = [Path(log.source).stem for log in logs]
+    return _MetricComparison(tuple(columns), tuple(rows))
+
+
+def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
+    """Returns a comparison of runs as plain values, ready for JSON.
+
+    A missing number is None, and the reason is given next to it.
+
+    Args:
+        comparison: The comparison.
+    """
+    rows = []
+    for row in comparison.rows:
+        quantity = row.quantity
+        content = {
+            "key": quantity.key,
+            "name": quantity.name,
+            "unit": quantity.unit,
+            "group": quantity.group,
+            "values": list(row.values),
+            "unknown": [entry.why or None for entry in row.entries],
+        }
+        rows.append(content)
+    return {"columns": list(comparison.columns), "rows": rows}
+
+
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
     """Comparison of the metrics and the scenarios of several logs, created by `compare`.
@@ -58,7 +144,7 @@ class LogComparison(Result):
     """
 
     logs: tuple[Log, ...]
-    metrics: MetricComparison
+    metrics: _MetricComparison
     differences: list[ScenarioDifference]
     means: Sequence[MeanInterval | None]
     remarks: dict[str, list[str]]
@@ -100,7 +186,7 @@ class LogComparison(Result):
             for line in lines:
                 yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
 
-        rows = select_most_different(self.metrics.rows)
+        rows = _select_most_different(self.metrics.rows)
         if rows:
             chosen = set(rows)
             means = [
@@ -129,7 +215,7 @@ class LogComparison(Result):
         else:
             yield "the same experiment"
 
-    def _sum_up(self, rows: Sequence[ComparisonRow]) -> str:
+    def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
         """Returns the judgements and the largest difference of the runs in one sentence.
 
         Args:
@@ -141,7 +227,7 @@ class LogComparison(Result):
         text = f"in short: {join_words(verdicts)}"
         if not rows:
             return f"{text}; no metric differs"
-        most = max(rows, key=lambda row: measure_difference(row.values))
+        most = max(rows, key=lambda row: _measure_difference(row.values))
         values = [format_number(value, 4) for value in most.values]
         unit = f" {most.quantity.unit}" if most.quantity.unit else ""
         return (
@@ -236,7 +322,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     )
 
 
-def measure_difference(values: Sequence[float | None]) -> float:
+def _measure_difference(values: Sequence[float | None]) -> float:
     """Returns how far values are apart, as a share of the largest of them.
 
     Args:
@@ -251,7 +337,7 @@ def measure_difference(values: Sequence[float | None]) -> float:
     return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
 
 
-def select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+def _select_most_different(rows: Sequence[_ComparisonRow]) -> list[_ComparisonRow]:
     """Returns the metrics that differ most between runs, in their order.
 
     Errors of the computation, which are rounding of different size in every run, are left out.
@@ -261,7 +347,7 @@ def select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
     """
     differences = {}
     for index, row in enumerate(rows):
-        difference = measure_difference(row.values)
+        difference = _measure_difference(row.values)
         if difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS:
             differences[index] = difference
     ranked = sorted(differences, key=lambda index: (-differences[index], index))
@@ -291,7 +377,7 @@ def _name_columns(files: Sequence[Path]) -> list[str]:
 
 
 def _average_repeats(
-    logs: Sequence[Log], metrics: MetricComparison
+    logs: Sequence[Log], metrics: _MetricComparison
 ) -> list[MeanInterval | None]:
     """Averages each quantity over logs that repeat one experiment with different seeds.
 
@@ -313,7 +399,7 @@ def _average_repeats(
 
 
 def _tabulate_quantities(
-    metrics: Sequence[ComparisonRow],
+    metrics: Sequence[_ComparisonRow],
     columns: Sequence[str],
     means: Sequence[MeanInterval | None],
 ) -> TextTable:

@@ -44,12 +44,13 @@ from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import find_absent_samples
-from trilat_net.fields import field_names, split_unit
+from trilat_net.fields import split_unit
 from trilat_net.log.log_reader import Log
 from trilat_net.log.record_columns import Ints
 from trilat_net.log.site_log import compute_task_errors
 from trilat_net.scenario import Expect, Scenario
 from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
+from trilat_net.scenario.key_checks import field_names
 
 BATCH_RECORDS = 1000
 """Number of records of a site in a batch."""
@@ -279,7 +280,7 @@ def run_compiled_in_batches(
     return run
 
 
-class WholeRun(NamedTuple):
+class _WholeRun(NamedTuple):
     """A simulated run with all of its records.
 
     Attributes:
@@ -293,7 +294,7 @@ class WholeRun(NamedTuple):
     run: FusedRun
 
 
-def run_whole(scenario: Scenario) -> WholeRun:
+def run_whole(scenario: Scenario) -> _WholeRun:
     """Runs a scenario in the compiled loop and keeps all records in memory.
 
     Args:
@@ -312,7 +313,7 @@ def run_whole(scenario: Scenario) -> WholeRun:
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
     trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return WholeRun(records, classify_run_end(scenario, trace), run)
+    return _WholeRun(records, classify_run_end(scenario, trace), run)
 
 
 class Range(NamedTuple):

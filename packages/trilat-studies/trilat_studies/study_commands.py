@@ -629,26 +629,3 @@ def bench_command(
     paths = write_bench(results, folder.path, format_command("bench", *arguments))
     terminal.print_result(results, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
-
-
-@options.command("run.mcap --site m1 --json > m1.json", page="docs/studies/measured-hands.md")
-def identify_hand_command(
-    file: options.LogsArgument,
-    site: Annotated[
-        str,
-        value("--site", "SITE", "Site of the held arm.", autocompletion=options.complete_sites),
-    ] = "m1",
-    as_json: options.JsonOption = False,
-) -> None:
-    """Identifies the mass, damping and stiffness of the hand that holds an arm.
-
-    A sum of sines must move the arm during the run, so the scenario needs an operator of kind
-    "multisine" at any site (docs/studies/measured-hands.md). `trilat linear
-    --operators` reads the JSON of the result.
-    """
-    from .hand_impedance import identify_hand
-
-    log = terminal.open_with_progress(*file)
-    with terminal.progress_lines(f"identifying the hand at {site}"):
-        identified = identify_hand(log, site)
-    terminal.print_result(identified, as_json=as_json)

@@ -50,10 +50,10 @@ from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.presentation.result_text import Block, MarkedText, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.scenario_reader import read_experiment, reseed_scenario
 from trilat_net.work.executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
 from trilat_net.work.intervals import MeanInterval, mean_interval
@@ -326,7 +326,7 @@ TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 """Headers of the columns of the table of expectations."""
 
 
-class ExpectationRow(NamedTuple):
+class _ExpectationRow(NamedTuple):
     """One expectation of a scenario, with the results of all runs of this scenario.
 
     The runs differ in their seeds. The object is a row in the table of a `TrialReport`.
@@ -385,7 +385,7 @@ class TrialReport(Result):
             groups.setdefault(result.trial.source, []).append(result)
         return groups
 
-    def rows(self) -> list[ExpectationRow]:
+    def rows(self) -> list[_ExpectationRow]:
         """Combines the results of each scenario to one row per expectation.
 
         If some runs of a scenario have no result, another row states their number.
@@ -399,7 +399,7 @@ class TrialReport(Result):
             for key, outcomes in outcomes_by_key.items():
                 # An unmet expectation is worse than any other. After that the margin decides.
                 worst = min(outcomes, key=lambda outcome: (outcome.held, outcome.margin or 0.0))
-                row = ExpectationRow(
+                row = _ExpectationRow(
                     scenario=name,
                     key=key,
                     worst=worst,
@@ -411,7 +411,7 @@ class TrialReport(Result):
 
             errors = [result.error for result in results if result.error]
             if errors:
-                row = ExpectationRow(
+                row = _ExpectationRow(
                     scenario=name,
                     key="a result",
                     worst=ExpectationResult("a result", False, errors[0], ""),

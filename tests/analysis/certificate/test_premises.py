@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import trilat_net
+from trilat_net.analysis.certificate import premise_text
 from trilat_net.analysis.certificate.premise_quantities import AbsentSpan, PremiseQuantities
 from trilat_net.analysis.certificate.premises import (
     Premise,
@@ -21,7 +22,6 @@ from trilat_net.analysis.certificate.premises import (
 from trilat_net.analysis.torque_sources import find_wall_energies
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-from trilat_net.presentation import premise_text
 from trilat_net.scenario import load_scenario
 
 from . import runs
@@ -106,7 +106,7 @@ def strings_in(value: object) -> Iterator[str]:
 
 
 def test_each_kind_of_quantities_has_its_sentence() -> None:
-    assert set(premise_text._DESCRIBE) == set(get_args(PremiseQuantities))
+    assert set(premise_text.DESCRIBERS) == set(get_args(PremiseQuantities))
 
 
 def test_unequal_scalars_of_kd_hold() -> None:

@@ -18,15 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from trilat_studies.log_comparison import compare_metrics, comparison_to_json
 
 import trilat_net
 from tests.analysis import logs
 from tests.analysis.logs import rewritten
-from trilat_net.analysis.metrics.log_metrics import (
-    compare_metrics,
-    comparison_to_json,
-    compute_log_metrics,
-)
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
 

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from tests.analysis.logs import rewritten
+from tests.analysis.logs import rewritten, simulated
 from trilat_net.analysis.aligned import align_records, find_latest_rows
+from trilat_net.analysis.dominance_history import trace_dominance
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 
 from .written import pair
@@ -57,6 +58,39 @@ def test_following_looks_back_and_the_spread_does_not() -> None:
     assert found.run["spread_end_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
     assert found.links["s->m"]["following_max_rad"].value is None
     assert not found.links["s->m"]["following_max_rad"].applies
+
+
+def test_undelayed_error_includes_what_the_delay_costs() -> None:
+    """A slave at q_m(t - T), with q_m = v t, has e = 0 and the undelayed error v T, as its master has."""
+    speed, delay_s = 0.4, 0.05
+
+    def motion(site: str, t_s: float) -> dict[str, list[float]]:
+        past = t_s if site == "m" else max(0.0, t_s - delay_s)
+        angles = [speed * past, -0.5 * speed * past]
+        return {"q": angles, "q_des": angles}
+
+    sites = compute_log_metrics(pair(motion)).sites
+    assert sites["s"]["max_error_rad"].value == 0.0
+    for site in ("m", "s"):
+        assert sites[site]["undelayed_max_rad"].value == pytest.approx(
+            speed * delay_s, rel=1e-9
+        )
+        assert sites[site]["undelayed_end_rad"].value == pytest.approx(
+            speed * delay_s, rel=1e-9
+        )
+        assert not sites[site]["undelayed_max_m"].applies
+
+
+def test_undelayed_error_weighs_peers_by_dominance() -> None:
+    """During a handover, the slave's undelayed error is q_s - sum_j alpha_sj(t) q_j, at every tick."""
+    log = simulated("handover")
+    sites = compute_log_metrics(log).sites
+    alpha = trace_dominance(log, "s", log["s"].t_s).alpha
+    peers = log.scenario.peers("s")
+    mean = sum(alpha[:, n, np.newaxis] * log[peer].q for n, peer in enumerate(peers))
+    error = np.abs(log["s"].q - mean)
+    assert np.ptp(alpha) != 0.0
+    assert sites["s"]["undelayed_max_rad"].value == pytest.approx(error.max(), rel=1e-12)
 
 
 def test_the_delay_of_following_is_the_one_in_use() -> None:

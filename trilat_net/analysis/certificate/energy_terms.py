@@ -190,7 +190,7 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     )
 
 
-class PeriodEnds(NamedTuple):
+class _PeriodEnds(NamedTuple):
     """The state of a site at both ends of all K - 1 tick periods, shape (K - 1, n) each.
 
     At the end of a period a new sample of a peer comes into use, and the error e jumps. In the
@@ -425,7 +425,7 @@ class SiteMotion:
         return limited & ~self.rests[:, np.newaxis]
 
     @cached_property
-    def ends(self) -> PeriodEnds:
+    def ends(self) -> _PeriodEnds:
         """The state of the site at the start and the end of every tick period.
 
         The reference is the motion that the site follows: the delayed motions of its peers,
@@ -482,7 +482,7 @@ class SiteMotion:
         jump_of_r = self.following.compute_jump_of_r(rows_after_jumps, jump_of_e)
         r_next = self.r[1:]
         e_next = records.e[1:]
-        return PeriodEnds(
+        return _PeriodEnds(
             following=following,
             link=link,
             dominance=dominance_jump,

@@ -27,8 +27,9 @@ from ...core.step.site_setup import Scheme, StaleAction
 from ...core.step.vectors import Array
 from ...errors import count_nouns
 from ...log.log_reader import Log
+from ...own_code.imported_code import ImportedLaw
 from ...results import JsonObject
-from ...scenario.describe import find_energy_laws
+from ...scenario.scenario_types import Scenario
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premise_quantities import BookedTorqueQuantities, BooksQuantities, SamplingQuantities
@@ -63,7 +64,7 @@ class ObservedFinding(StrEnum):
     NOT_JUDGED = "observed energy cannot be judged"
 
 
-class EnergyCurve(NamedTuple):
+class _EnergyCurve(NamedTuple):
     """An energy over time, of a kind that a control law declares.
 
     Some laws store energy, or keep account of the energy on the way between sites.
@@ -103,7 +104,7 @@ class EnergyCurve(NamedTuple):
         return f"{self.kind} {preposition} {self.site}"
 
 
-class LeastEnergy(NamedTuple):
+class _LeastEnergy(NamedTuple):
     """The minimum over time of an energy that must not be below zero.
 
     Attributes:
@@ -136,11 +137,11 @@ class ObservedEnergy(NamedTuple):
     finding: ObservedFinding
     text: str
     premises: Sequence[Premise] = ()
-    least: Sequence[LeastEnergy] = ()
+    least: Sequence[_LeastEnergy] = ()
     largest_j: float = 0.0
     residual_j: float = 0.0
     sampling_j: float = 0.0
-    curves: Sequence[EnergyCurve] = ()
+    curves: Sequence[_EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
         """Returns this verdict on the declared energies as plain values, ready for JSON.
@@ -173,6 +174,28 @@ class _SiteBooks(NamedTuple):
     taken: Array
     residual: Array
     leak: Array
+
+
+def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
+    """Returns the control laws that declare energies, by site.
+
+    Args:
+        scenario: Scenario of the run.
+        own_laws: True to also create laws that are not part of this program, which runs their
+            code.
+
+    Raises:
+        ScenarioError: The file of a law that is not part of this program is missing.
+    """
+    laws: dict[str, Any] = {}
+    for site, spec in scenario.sites.items():
+        setup = scenario.setup(site)
+        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
+        if setup.law_factory is not None and is_allowed:
+            law = setup.law_factory(setup.law_context())
+            if callable(getattr(law, "energies", None)):
+                laws[site] = law
+    return laws
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
@@ -364,7 +387,7 @@ def _read_peer_records(
     return PeerRecords(tick, received, sent_to_peer)
 
 
-def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCurve]:
+def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
     """Yields the energies that must not be below zero, over time.
 
     Args:
@@ -389,7 +412,7 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
 
         for kind, peer, energy in energies:
             parts = energy.reshape(len(energy), -1)
-            yield EnergyCurve(
+            yield _EnergyCurve(
                 kind=kind,
                 site=site,
                 peer=peer,
@@ -397,7 +420,7 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
                 energy_j=_add_parts(energy),
                 least_j=parts.min(axis=1),
             )
-        yield EnergyCurve(
+        yield _EnergyCurve(
             kind="taken",
             site=site,
             peer="",
@@ -418,7 +441,7 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     least = []
     for curve in curves:
         row = int(curve.least_j.argmin())
-        minimum = LeastEnergy(
+        minimum = _LeastEnergy(
             name=curve.name,
             amount_j=float(curve.least_j[row]),
             at_s=float(curve.t_s[row]),
@@ -428,7 +451,7 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     largest_j = max(float(curve.energy_j.max()) for curve in curves)
     for site, site_books in books.items():
         port = site_books.port
-        curve = EnergyCurve(
+        curve = _EnergyCurve(
             kind="given",
             site=site,
             peer="",

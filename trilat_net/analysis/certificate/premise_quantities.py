@@ -2,7 +2,7 @@
 
 A site is the process that runs one arm, and the sites follow each other. A condition of the
 theorem is called a premise. `premises` and `observed_energy` compute the quantities from the
-log of a run. `presentation.premise_text` writes the sentences about them.
+log of a run. `premise_text` writes the sentences about them.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.

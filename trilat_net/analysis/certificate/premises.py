@@ -16,7 +16,7 @@ The module also collects how many records were available.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      it. The package `presentation` writes the sentences about them.
+      it. `premise_text` writes the sentences about them.
     - Missing information never makes a run stable. The judgement stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some sites.
     - A log that was changed after it was written does not pass.
@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...hooks import find_hook
 from ...log.accounting import Coverage
 from ...log.log_reader import Log
 from ...log.running_digest import Integrity
@@ -82,6 +81,7 @@ from .premise_quantities import (
     TouchedStop,
     WallQuantities,
 )
+from .premise_text import DESCRIBERS, describe_missing_functionals
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages of samples that differ by less than this count as equal, in s.
@@ -129,14 +129,14 @@ class Premise(NamedTuple):
     @property
     def text(self) -> str:
         """The evidence, as a sentence."""
-        return str(find_hook("describe a premise")(self.quantities))
+        return DESCRIBERS[type(self.quantities)](self.quantities)
 
     def to_json(self) -> JsonObject:
         """Returns the premise as plain values, with the keys of `trilat certify --json`."""
         return {"name": self.name, "holds": self.holds, "text": self.text}
 
 
-def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
+def _find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
     """Finds the arms for which the energy function of the stability proof does not exist.
 
     The energy exists only for certain control laws. It requires the true dynamic parameters of
@@ -178,7 +178,7 @@ def explain_no_functional(scenario: Scenario) -> str:
         The names of these arms' sites and the reasons, separated by semicolons. Empty if the
         energy exists for every arm.
     """
-    return str(find_hook("describe missing functionals")(find_missing_functionals(scenario)))
+    return describe_missing_functionals(_find_missing_functionals(scenario))
 
 
 class FunctionalFacts(NamedTuple):
@@ -208,7 +208,7 @@ class FunctionalFacts(NamedTuple):
     tolerance: float
 
 
-class RunFacts(NamedTuple):
+class _RunFacts(NamedTuple):
     """Everything from a log that is needed to check the conditions of the stability theorem.
 
     The theorem says that an energy function V of all arms does not rise by itself.
@@ -227,7 +227,7 @@ class RunFacts(NamedTuple):
     unknown: str = ""
 
 
-def gather_facts(log: Log) -> RunFacts:
+def gather_facts(log: Log) -> _RunFacts:
     """Computes from a log what is needed to check the conditions of the stability theorem.
 
     The theorem uses an energy function of all arms. This function does not exist for every
@@ -243,16 +243,16 @@ def gather_facts(log: Log) -> RunFacts:
     """
     lacking = explain_no_functional(log.scenario)
     if lacking:
-        return RunFacts(log, {}, unknown=lacking)
+        return _RunFacts(log, {}, unknown=lacking)
 
     constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
     energies = compute_site_energies(log)
     if not energies:
-        return RunFacts(log, constants, unknown=NO_COMMON_TIME)
+        return _RunFacts(log, constants, unknown=NO_COMMON_TIME)
     balance = compute_energy_balance(energies)
     absent = find_absent_spans(log)
     if not balance.judged.any():
-        return RunFacts(log, constants, unknown=NO_PERIOD)
+        return _RunFacts(log, constants, unknown=NO_PERIOD)
 
     closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
     ambiguous = next((groups for groups in closed_groups if len(groups) > 1), ())
@@ -272,10 +272,10 @@ def gather_facts(log: Log) -> RunFacts:
         unjudged=unjudged_while_present,
         tolerance=float(np.ptp(balance.unexplained)) + sampling_j + ZERO_ENERGY_J,
     )
-    return RunFacts(log, constants, facts)
+    return _RunFacts(log, constants, facts)
 
 
-def check_premises(run: RunFacts) -> list[Premise]:
+def check_premises(run: _RunFacts) -> list[Premise]:
     """Checks whether a run meets the conditions (premises) of the stability theorem.
 
     It also checks that virtual walls, whose force is computed once per tick, generate no
@@ -288,7 +288,7 @@ def check_premises(run: RunFacts) -> list[Premise]:
     Returns:
         The premises that concern this run, in the order in which a certificate lists them.
     """
-    missing = find_missing_functionals(run.log.scenario)
+    missing = _find_missing_functionals(run.log.scenario)
     law = Premise("law", bool(run.constants), LawQuantities(tuple(missing)))
     premises: list[Premise | None] = [law]
 
@@ -302,7 +302,7 @@ def check_premises(run: RunFacts) -> list[Premise]:
     return [premise for premise in premises if premise is not None]
 
 
-def _check_parameters(run: RunFacts) -> Premise:
+def _check_parameters(run: _RunFacts) -> Premise:
     """Checks that the adaptive laws can learn the parameters theta of their arms.
 
     A law keeps its estimates within a box, so theta must lie in that box. Parameters that a law
@@ -326,7 +326,7 @@ def _check_parameters(run: RunFacts) -> Premise:
     return Premise("parameters", not faults, ParameterQuantities(tuple(faults)))
 
 
-def _check_gains(run: RunFacts) -> Premise:
+def _check_gains(run: _RunFacts) -> Premise:
     """Checks that the gains Kd of all sites are positive and equal up to a scalar per site.
 
     Only then do weights beta exist with which the exchanged energies of all sites cancel in V.
@@ -782,12 +782,24 @@ class Evidence(NamedTuple):
 
         Empty if they suffice.
         """
-        return list(find_hook("list the faults of evidence")(self))
+        least = self.min_coverage
+        reasons = []
+        if not self.integrity.passed:
+            reasons.append(f"the log is not as it was made: {self.integrity.text}")
+        if self.coverage.share < least:
+            reasons.append(f"records are missing: {self.coverage.describe(least)}")
+        share = self.functional_share
+        if share is not None and share < least:
+            reasons.append(f"V is judged over {100.0 * share:.4g} % of its periods")
+        if self.unmet:
+            sites = " and ".join(self.unmet)
+            reasons.append(f"{sites}, as recorded, did not react to this run")
+        return reasons
 
     @property
     def text(self) -> str:
         """A sentence for the user: how many records exist, and whether the log is unchanged."""
-        return str(find_hook("describe evidence")(self))
+        return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
 
     def to_json(self) -> dict[str, Any]:
         """Returns how complete and how authentic the records are, as plain values.
@@ -804,7 +816,7 @@ class Evidence(NamedTuple):
         }
 
 
-def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
+def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     """Collects how complete the records of a run are, and whether its log is unchanged.
 
     Args:

@@ -21,7 +21,6 @@ import numpy as np
 
 from ...core.step.ticks import CoreChange
 from ...core.step.vectors import Array
-from ...hooks import find_hook
 from ...net.messages import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
@@ -45,6 +44,7 @@ from .energy_balance import (
     find_common_times,
     find_dominance_matrices,
 )
+from .premise_text import describe_closed_groups
 from .premises import explain_no_functional
 
 STEP_S = 0.25
@@ -354,7 +354,7 @@ class RunningEnergy:
             if len(groups) > 1:
                 sites = list(energies)
                 names = [[sites[n] for n in group] for group in groups[:2]]
-                self.reason = find_hook("describe closed groups")(names)
+                self.reason = describe_closed_groups(names)
                 return None
 
         is_known = len(find_common_times(energies)) > 1

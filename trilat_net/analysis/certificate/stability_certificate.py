@@ -30,7 +30,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.step.vectors import Array
-from ...hooks import find_hook
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
@@ -47,6 +46,7 @@ from .energy_balance import (
     rise_above_minimum,
 )
 from .observed_energy import ObservedEnergy, ObservedFinding, observe_energies
+from .premise_text import describe_closed_groups
 from .premises import (
     Evidence,
     FunctionalFacts,
@@ -96,7 +96,7 @@ class StabilityFinding(StrEnum):
     NOT_JUDGED = "V cannot be judged"
 
 
-class FunctionalRise(NamedTuple):
+class _FunctionalRise(NamedTuple):
     """The largest rise of the arms' total energy that nobody supplied from outside.
 
     The energy is the function V of the stability proof, less the work of operators and
@@ -116,7 +116,7 @@ class FunctionalRise(NamedTuple):
     causes: dict[str, float]
 
 
-class StabilityVerdict(NamedTuple):
+class _StabilityVerdict(NamedTuple):
     """What the energy function V of the stability proof shows about a run.
 
     Attributes:
@@ -128,7 +128,7 @@ class StabilityVerdict(NamedTuple):
 
     finding: StabilityFinding
     text: str
-    rise: FunctionalRise | None = None
+    rise: _FunctionalRise | None = None
     tolerance: float = 0.0
 
 
@@ -160,7 +160,7 @@ class Certificate(Result):
     """
 
     premises: list[Premise]
-    verdict: StabilityVerdict
+    verdict: _StabilityVerdict
     end: RunEnd
     evidence: Evidence
     balance: EnergyBalance | None = None
@@ -182,7 +182,7 @@ class Certificate(Result):
         return laws != [False]
 
     @property
-    def paper_weights_rise(self) -> FunctionalRise | None:
+    def paper_weights_rise(self) -> _FunctionalRise | None:
         """The largest rise that the total energy would have if all arms had the same weight.
 
         The paper on which the control law is based uses such equal weights in the energy
@@ -374,7 +374,7 @@ def certify(
     facts = run.functional
     premises = check_premises(run)
 
-    verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
+    verdict = _StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
     if facts is not None:
         verdicts = (judge(facts, premises) for judge in JUDGEMENTS)
         verdict = next(verdict for verdict in verdicts if verdict is not None)
@@ -406,7 +406,9 @@ def certify(
     )
 
 
-def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+def _judge_site_balances(
+    run: FunctionalFacts, _: Sequence[Premise]
+) -> _StabilityVerdict | None:
     """Returns a verdict if the energy balance of some site does not close.
 
     Each site is judged by itself. If energy appears or disappears without a source, the records
@@ -441,14 +443,14 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     if not simulated:
         arms = f"the external arm of {', '.join(external)}"
         text += f": {arms} does not move as its theta says, or somebody pushes it"
-        return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+        return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
     is_clear = error_j[site] > compute_bound_j(site, CLEAR_BREAK_SHARE)
     is_certain = is_clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
     reason = FALSE_RECORDS_TEXT if is_certain else _PERIOD_OR_FALSE
-    return StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {reason}")
+    return _StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {reason}")
 
 
-def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerdict | None:
     """Returns a verdict if recorded torques differ from the control law, Eq. (13)."""
     for site, energy in run.energies.items():
         records = energy.motion.records
@@ -461,19 +463,19 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
                 f"the torque of {site} is not that of Eq. (13), by up to "
                 f"{error_nm.max():.3g} N m, from {from_s:.4g} s on: {FALSE_RECORDS_TEXT}"
             )
-            return StabilityVerdict(StabilityFinding.BROKEN, text)
+            return _StabilityVerdict(StabilityFinding.BROKEN, text)
     return None
 
 
-def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerdict | None:
     """Returns a verdict if V cannot be judged.
 
     This is the case if the weights beta of the sites in V are not unique, or if the energies
     are not known precisely enough to decide whether V rose.
     """
     if run.groups:
-        text = find_hook("describe closed groups")(run.groups)
-        return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+        text = describe_closed_groups(run.groups)
+        return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
     scale = run.balance.scale
     if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
@@ -481,10 +483,10 @@ def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> Stability
         "the period is too long for these gains, so its energies are known only to "
         f"{run.tolerance:.3g} J of {scale:.4g} J"
     )
-    return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+    return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
 
 
-def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
+def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> _StabilityVerdict:
     """Returns the verdict of a run whose V can be judged.
 
     The verdict depends on whether V rose beyond the supplied energy, and on whether the
@@ -506,7 +508,7 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
             f"from {rise.from_s:.4g} to {rise.at_s:.4g} s"
         )
         text += f"; given by {causes}" if causes else "; nobody gave it"
-        return StabilityVerdict(StabilityFinding.ROSE, text, rise)
+        return _StabilityVerdict(StabilityFinding.ROSE, text, rise)
 
     # Energies that are rounding errors are written as zero.
     first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
@@ -520,11 +522,11 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     text = "; ".join([text, *undecided])
 
     if failed:
-        return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}; {text}")
+        return _StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}; {text}")
     covered = StabilityFinding.COVERED.value
     if undecided:
         covered += ", as far as the log tells"
-    return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
+    return _StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
 
 
 JUDGEMENTS = (
@@ -539,7 +541,7 @@ They decide whether the records are false, whether V can be judged, and whether 
 """
 
 
-def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
+def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> _FunctionalRise | None:
     """Finds the largest rise of V above an earlier minimum, and the sources of its energy.
 
     The work of operators and environments is subtracted from V before.
@@ -574,7 +576,7 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     for name in sorted(causes, key=lambda name: -causes[name]):
         if causes[name] > least_amount:
             notable[name] = causes[name]
-    return FunctionalRise(
+    return _FunctionalRise(
         from_s=float(balance.t_s[first]),
         at_s=float(balance.t_s[last]),
         amount=float(rise[last]),
@@ -655,7 +657,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
     }
 
 
-def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
+def _rise_to_json(rise: _FunctionalRise | None) -> JsonObject | None:
     """Returns a rise of V as plain values, with the keys of the JSON output."""
     if rise is None:
         return None

@@ -13,11 +13,11 @@ Invariant:
 
 import math
 import pkgutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -226,15 +226,15 @@ class LogMetrics(Result):
         """Returns one number of a quantity for the whole run.
 
         The numbers of sites, links or walls are reduced to their maximum or sum, see
-        `reduce_to_run`.
+        `_reduce_to_run`.
 
         Args:
             quantity: The quantity.
         """
-        return reduce_to_run(quantity, self.values_of(quantity))
+        return _reduce_to_run(quantity, self.values_of(quantity))
 
 
-def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
+def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
     """Reduces the numbers of a quantity to one number of the whole run.
 
     It is the largest number of all subjects (sites, links or walls), or their sum. Subjects to
@@ -389,7 +389,7 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         values_by_subject = {}
         for subject, metrics in values[quantity.of].items():
             values_by_subject[subject] = metrics[key]
-        run_values[key] = reduce_to_run(quantity, values_by_subject)
+        run_values[key] = _reduce_to_run(quantity, values_by_subject)
     return run_values
 
 
@@ -490,90 +490,3 @@ def _replace_not_finite(value: Any) -> Any:
 def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
     """Returns the numbers of metrics by key. Missing numbers are None."""
     return {key: metric.value for key, metric in metrics.items()}
-
-
-class ComparisonRow(NamedTuple):
-    """One quantity in several runs, as a row of a table.
-
-    Attributes:
-        quantity: The quantity.
-        entries: The metric of the quantity in each run, in the order of the columns.
-    """
-
-    quantity: Quantity
-    entries: tuple[Metric, ...]
-
-    @property
-    def values(self) -> tuple[float | None, ...]:
-        """The value of the quantity in each of the compared runs. None where it is missing."""
-        return tuple(entry.value for entry in self.entries)
-
-
-class MetricComparison(NamedTuple):
-    """Metrics of several runs, side by side, as a table.
-
-    Attributes:
-        columns: Names of the runs.
-        rows: All quantities that apply to at least one of the runs, in the order in which they
-            are shown.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[ComparisonRow, ...]
-
-    def row(self, key: str) -> ComparisonRow:
-        """Returns the row of this comparison that shows a quantity in all logs.
-
-        Args:
-            key: Key of the quantity, such as "sharing_off".
-
-        Raises:
-            KeyError: No row has this key.
-        """
-        row_by_key = {row.quantity.key: row for row in self.rows}
-        return row_by_key[key]
-
-
-def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
-    """Computes the metrics of several logs, so that they can be shown in one table.
-
-    Args:
-        logs: The logs, which may be torn, short or empty.
-        names: Names of the columns. By default the names of the logs' files.
-
-    Raises:
-        LogError: A record cannot be read, or names a change that is not valid.
-    """
-    measured = [compute_log_metrics(log) for log in logs]
-    rows = []
-    for quantity in quantities():
-        entries = tuple(metrics.run_value(quantity) for metrics in measured)
-        if any(entry.applies for entry in entries):
-            rows.append(ComparisonRow(quantity, entries))
-    columns = list(names)
-    if not columns:
-        columns = [Path(log.source).stem for log in logs]
-    return MetricComparison(tuple(columns), tuple(rows))
-
-
-def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
-    """Returns a comparison of runs as plain values, ready for JSON.
-
-    A missing number is None, and the reason is given next to it.
-
-    Args:
-        comparison: The comparison.
-    """
-    rows = []
-    for row in comparison.rows:
-        quantity = row.quantity
-        content = {
-            "key": quantity.key,
-            "name": quantity.name,
-            "unit": quantity.unit,
-            "group": quantity.group,
-            "values": list(row.values),
-            "unknown": [entry.why or None for entry in row.entries],
-        }
-        rows.append(content)
-    return {"columns": list(comparison.columns), "rows": rows}

@@ -224,6 +224,7 @@ class Measure(NamedTuple):
 
 _MEASURES: list[Measure] = []
 TRACKING = "tracking"
+UNDELAYED = "tracking without delay"
 SPREAD = "apart"
 FOLLOWING = "slave and master"
 EFFORT = "effort"
@@ -236,6 +237,7 @@ NETWORK = "network"
 LOOP = "loop"
 _GROUP_ORDER = (
     TRACKING,
+    UNDELAYED,
     SPREAD,
     FOLLOWING,
     EFFORT,

@@ -30,7 +30,7 @@ from ...results import JsonObject
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
-from ..aligned import AlignedRecords, Bools, find_common_rows
+from ..aligned import AlignedRecords, Bools, PeerTrajectory, find_common_rows
 from ..arm_rows import (
     ArmRows,
     PlanarArmRows,
@@ -50,6 +50,7 @@ from .measures import (
     NETWORK,
     SPREAD,
     TRACKING,
+    UNDELAYED,
     Metric,
     MetricValues,
     Quantity,
@@ -65,12 +66,17 @@ from .measures import (
 LONG_END_S = 5.0
 """Length of the end of a run in which contact and slopes of estimates are measured, in s."""
 _ERRORS = {"rms_error": "RMS e", "max_error": "peak |e|", "max_error_end": "peak |e|, last 1 s"}
+_UNDELAYED_ERRORS = {
+    "undelayed_rms": "RMS of {0} from where the peers are then",
+    "undelayed_max": "largest distance of {0} from where the peers are then",
+    "undelayed_end": "largest distance of {0} from where the peers are then, last 1 s",
+}
 _SPREADS = {
     "spread_rms": "RMS spread, undelayed",
     "spread_max": "largest spread",
     "spread_end": "largest spread, last 1 s",
 }
-_LAGS = {
+_DELAYED_DISTANCES = {
     "following_rms": "RMS {0}_m(t-T) - {0}_s",
     "following_max": "peak |{0}_m(t-T) - {0}_s|",
     "following_end": "peak |{0}_m(t-T) - {0}_s|, last 1 s",
@@ -84,7 +90,7 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     Quantity("settle_s", "settling time", "s"),
     *list_shared_quantities(_ERRORS),
 )
-def measure_tracking(view: RunView, site: str) -> MetricValues:
+def _measure_tracking(view: RunView, site: str) -> MetricValues:
     """Measures how well a site tracks its reference: settling time, RMS and peak of the error.
 
     The error e is the difference between the coordinates of the site and their reference, the
@@ -114,8 +120,75 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
     return metrics
 
 
+@measures("site", UNDELAYED, *list_shared_quantities(_UNDELAYED_ERRORS))
+def measure_undelayed_error(view: RunView, site: str) -> MetricValues:
+    """Measures how far a site is from where its peers are at the same time.
+
+    The error e of a site compares its coordinates with what its peers sent some time ago. The
+    undelayed error compares them with the peers' coordinates at the same time t, weighted by
+    the dominance factors:
+
+        q_i(t) - sum_j alpha_ij(t) q_j(t)
+
+    It therefore includes what the delay costs. Between the ticks of a peer its motion is
+    interpolated.
+
+    Args:
+        view: The run.
+        site: Name of the site.
+    """
+    log = view.log
+    followed = _list_followed_peers(view, site)
+    missing = [name for name in (site, *followed) if name not in view.sites]
+    if missing:
+        return unavailable(UNDELAYED, f"no records of {', '.join(missing)}")
+    if not followed:
+        return unavailable(UNDELAYED, f"{site} follows nobody", applies=False)
+
+    run = view.sites[site]
+    records = run.records
+    t_s = records.t_s
+    known = records.known.copy()
+    mean = np.zeros_like(records.shared)
+    for peer, alpha in followed.items():
+        peer_records = view.sites[peer].records
+        motion = PeerTrajectory(peer_records).evaluate(t_s)
+        known &= motion.known & (t_s <= peer_records.t_s[-1])
+        positions = motion.q
+        if records.x.shape[1] == POSE:
+            orientations = choose_nearest_vectors(
+                positions[:, POSITION:], records.x[:, POSITION:]
+            )
+            positions[:, POSITION:] = orientations
+        mean += alpha[:, np.newaxis] * positions
+    if not known.any():
+        return unavailable(UNDELAYED, "no instant of which every site has a record")
+
+    if records.x.size:
+        error = compute_task_errors(records.x, mean, records.axes)
+    else:
+        error = records.q - mean
+    return measure_shared(
+        group=UNDELAYED,
+        space=log.scenario.sites[site].task.space,
+        keys=_UNDELAYED_ERRORS,
+        differences=error[known],
+        at_end=records.known_at_end(END_WINDOW_S)[known],
+        why_not_at_end="in the last second there is no time at which every site has a record",
+    )
+
+
+def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
+    """Returns the dominance factors of the followed peers over time, shape (K,) each."""
+    if site not in view.sites:
+        return {}
+    alpha = view.sites[site].dominance.alpha
+    peers = view.scenario.peers(site)
+    return {peer: alpha[:, n] for n, peer in enumerate(peers) if alpha[:, n].any()}
+
+
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
-def measure_spread(view: RunView, _run: str) -> MetricValues:
+def _measure_spread(view: RunView, _run: str) -> MetricValues:
     """Measures the spread of a run: how far the sites are apart at the same instant.
 
     It is the largest difference of a joint angle between two sites. In task space the positions
@@ -160,8 +233,8 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     )
 
 
-@measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
-def measure_following(view: RunView, link: str) -> MetricValues:
+@measures("link", FOLLOWING, *list_shared_quantities(_DELAYED_DISTANCES))
+def _measure_following(view: RunView, link: str) -> MetricValues:
     """Measures how far a slave is from the delayed motion of its master.
 
     The distance is q_m(t - T) - q_s, where T is the age of the sample in use, the state of the
@@ -200,7 +273,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     return measure_shared(
         group=FOLLOWING,
         space=specs[site].task.space,
-        keys=_LAGS,
+        keys=_DELAYED_DISTANCES,
         differences=lag[known],
         at_end=slave.known_at_end(END_WINDOW_S)[known],
         why_not_at_end="no sample in the last second",
@@ -216,7 +289,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("saturated_share", "ticks at the limit"),
     Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
 )
-def measure_effort(view: RunView, site: str) -> MetricValues:
+def _measure_effort(view: RunView, site: str) -> MetricValues:
     """Measures how much torque a site's controller applies, and how often it is at the limit.
 
     Args:
@@ -263,7 +336,7 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     Quantity("end_force_peak_n", "its peak, last 5 s", "N"),
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
-def measure_wall_contact(view: RunView, name: str) -> MetricValues:
+def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
     """Measures the contact of an end effector with a virtual wall: force, hits and depth.
 
     The numbers are given for the whole run and for its last 5 s. A contact in the first record,
@@ -303,7 +376,7 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
     return {key: metrics[key] for key in unavailable(CONTACT, "")}  # in the declared order
 
 
-class BaseEstimates(NamedTuple):
+class _BaseEstimates(NamedTuple):
     """Estimates of the base parameters of a chain, which are those that torques determine.
 
     The parameters of neighbouring links act on the torques only in certain combinations, the
@@ -346,7 +419,7 @@ class ParameterEstimates(NamedTuple):
     first: list[float]
     last: list[float]
     slope_per_s: list[float] | None
-    base: BaseEstimates | None = None
+    base: _BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
         """Returns the parameter estimates of the arm as plain values, ready for JSON."""
@@ -357,7 +430,9 @@ class ParameterEstimates(NamedTuple):
         return content
 
 
-def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
+def _read_parameter_estimates(
+    scenario: Scenario, records: AlignedRecords
+) -> ParameterEstimates:
     """Reads from the records what a site learnt about the dynamic parameters of its arm.
 
     Args:
@@ -407,7 +482,7 @@ def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
         The estimates, by name of the site. Sites without records are missing.
     """
     return {
-        site: read_parameter_estimates(view.scenario, run.records)
+        site: _read_parameter_estimates(view.scenario, run.records)
         for site, run in view.sites.items()
     }
 
@@ -417,8 +492,8 @@ def _estimate_base_parameters(
     learnt: Bools,
     theta: list[float] | None,
     theta_hat: Array,
-) -> BaseEstimates:
-    """Returns the estimates of a chain in base parameters, see `BaseEstimates`.
+) -> _BaseEstimates:
+    """Returns the estimates of a chain in base parameters, see `_BaseEstimates`.
 
     Args:
         arm: The chain.
@@ -433,7 +508,7 @@ def _estimate_base_parameters(
     true_base = None
     if theta is not None:
         true_base = (base.combination @ np.array(theta)).tolist()
-    return BaseEstimates(
+    return _BaseEstimates(
         parameter=base.kept.tolist(),
         theta=true_base,
         first=first,
@@ -453,7 +528,7 @@ def _estimate_base_parameters(
     Quantity("theta_slope_per_s", "|theta_hat'|, last 5 s", "1/s"),
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
-def measure_parameter_error(view: RunView, site: str) -> MetricValues:
+def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
     """Measures how far a site's estimates of its arm's parameters are from the true values.
 
     For a chain of joints the errors are computed in base parameters, which are the combinations
@@ -556,7 +631,7 @@ def _compute_parameter_energy(
     Quantity("burst", "lost in a row, mean"),
     Quantity("late_samples", "late samples", "", "sum"),
 )
-def measure_network(view: RunView, name: str) -> MetricValues:
+def _measure_network(view: RunView, name: str) -> MetricValues:
     """Measures a link: the effective delay, lost samples and bursts of losses.
 
     The effective delay is the age of the sample that the receiver uses.
@@ -594,7 +669,7 @@ def measure_network(view: RunView, name: str) -> MetricValues:
     Quantity("overruns", "overruns", "", "sum"),
     Quantity("missing", "missing records", "", "sum"),
 )
-def measure_loop(view: RunView, site: str) -> MetricValues:
+def _measure_loop(view: RunView, site: str) -> MetricValues:
     """Measures the timing of a site's control loop, and counts its missing records.
 
     Args:

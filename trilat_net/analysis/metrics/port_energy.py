@@ -72,7 +72,7 @@ def trapezoid_work(torque: Array, q: Array) -> Array:
     return held_work(mean_torque, q)
 
 
-def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
+def _held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     """Returns the torque that the controller applied during every tick period.
 
     For an arm that is not simulated, the torque of the drives between two ticks is unknown. The
@@ -97,7 +97,7 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     return held[:-1]
 
 
-def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
+def _mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     """Computes the kinetic and potential energy of an arm at every record, in J.
 
     For the planar arm the energy is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)),
@@ -131,7 +131,7 @@ def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     Quantity("mechanical_j", "gained by the arm", "J", "sum"),
     Quantity("unaccounted_j", "unaccounted for", "J"),
 )
-def measure_port_energy(view: RunView, site: str) -> MetricValues:
+def _measure_port_energy(view: RunView, site: str) -> MetricValues:
     """Measures the energies that an arm exchanged with controller, operator and environment.
 
     Only tick periods with a record at both ends count. The mechanical stops of joints count as
@@ -158,7 +158,7 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
         known_work = np.where(known, work, 0.0)
         return np.cumsum(known_work)
 
-    controller_torque = held_control_torque(records, scenario)
+    controller_torque = _held_control_torque(records, scenario)
     controller = accumulate(held_work(controller_torque, q))
 
     operator_now_work = trapezoid_work(torque.operator_now, q)
@@ -193,7 +193,7 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
         unknown = Metric(None, "theta of the arm is not known")
         return {**metrics, "mechanical_j": unknown, "unaccounted_j": unknown}
 
-    energy = mechanical_energy(arm, records)
+    energy = _mechanical_energy(arm, records)
     gained = accumulate(np.diff(energy))
     unaccounted = gained - controller - operator - walls + friction
     largest_unaccounted = np.abs(unaccounted).max()
@@ -214,7 +214,7 @@ def _measure_most(energy: Array) -> Metric:
     Quantity("delay_j", "given by the delay", "J", "sum"),
     Quantity("delay_most_j", "given by the delay, most at any time", "J"),
 )
-def measure_delay_energy(view: RunView, link: str) -> MetricValues:
+def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     """Measures the energy that the delay of a link injects into the receiving arm, in J.
 
     A site is the process that runs one arm. The delay makes it follow an old position of the

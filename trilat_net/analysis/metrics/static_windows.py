@@ -59,7 +59,7 @@ MIN_LOAD_SHARE = 0.02
 """Smallest torque of a loaded site, as a share of the largest torque of all sites."""
 
 
-class StaticWindow(NamedTuple):
+class _StaticWindow(NamedTuple):
     """A window of time in which all arms rest, with means over the window for each site.
 
     Attributes:
@@ -82,7 +82,7 @@ class StaticWindow(NamedTuple):
     alpha: Array
 
 
-def find_static_windows(view: RunView) -> list[StaticWindow]:
+def _find_static_windows(view: RunView) -> list[_StaticWindow]:
     """Finds the static windows of a run, in order.
 
     A window is the last `WINDOW_S` of an interval in which all sites rest. Each interval has
@@ -161,7 +161,7 @@ def _average_window(
     runs: Mapping[str, SiteRun],
     rows: Mapping[str, Ints],
     t_s: Array,
-) -> StaticWindow:
+) -> _StaticWindow:
     """Returns a static window with the means over its ticks.
 
     Args:
@@ -170,7 +170,7 @@ def _average_window(
         t_s: Times of the window, in s.
     """
     names = list(runs)
-    window = StaticWindow(
+    window = _StaticWindow(
         from_s=float(t_s[0]),
         to_s=float(t_s[-1]),
         torque={},
@@ -231,7 +231,7 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
         view: The run.
     """
     estimates = []
-    for before, after in pairwise(view.compute_once(find_static_windows)):
+    for before, after in pairwise(view.compute_once(_find_static_windows)):
         site = _find_single_mover(before, after)
         if not site or (before.alpha != after.alpha).any():
             continue
@@ -261,7 +261,7 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
     return estimates
 
 
-def _find_single_mover(before: StaticWindow, after: StaticWindow) -> str:
+def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
     """Returns the site of the only operator that acted differently in two static windows.
 
     Returns:
@@ -359,7 +359,7 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
         The loads, by window and joint. Joints without a load are left out.
     """
     loads = []
-    for window in view.compute_once(find_static_windows):
+    for window in view.compute_once(_find_static_windows):
         weights = _compute_torque_weights(view.scenario, window.alpha)
         common_joints = min(map(len, window.torque.values()))
         for joint in range(common_joints):
@@ -384,7 +384,7 @@ def count_static_windows(view: RunView) -> Metric:
     """
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
-    windows = view.compute_once(find_static_windows)
+    windows = view.compute_once(_find_static_windows)
     reason = "no second in which all sites rest under constant torques"
     return metric(len(windows) or None, reason)
 
@@ -394,7 +394,7 @@ def count_static_windows(view: RunView) -> Metric:
     SHARING,
     Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
 )
-def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
+def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     """Measures how well operators feel the torque that the sharing of forces predicts.
 
     Operators feel the torques on other arms according to the dominance factors, which are the
@@ -423,7 +423,7 @@ def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
 
 
 def _weigh_load(
-    window: StaticWindow,
+    window: _StaticWindow,
     joint: int,
     torque: dict[str, float],
     weights: Array | str,
@@ -476,7 +476,7 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
     Returns:
         The comparisons by time. Empty if there is no joint of this kind.
     """
-    static_windows = view.compute_once(find_static_windows)
+    static_windows = view.compute_once(_find_static_windows)
     windows = {window.from_s: window for window in static_windows}
     ratios = []
     for load in view.compute_once(find_joint_loads):

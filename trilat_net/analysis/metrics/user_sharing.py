@@ -56,7 +56,7 @@ def _not_applicable(reason: str) -> Metric:
     return Metric(None, reason, applies=False)
 
 
-def read_user_shares(view: RunView) -> UserShares | Metric:
+def _read_user_shares(view: RunView) -> UserShares | Metric:
     """Reads the weights with which the slave arm followed each of its users over time.
 
     Each user moves a master arm, and the slave follows the masters with weights, the dominance
@@ -86,7 +86,7 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     Quantity("authority_effort_nm2_s", "the hand's effort by share", "N²m²s", "sum"),
     Quantity("motion_share", "share in the slave's motion"),
 )
-def measure_authority(view: RunView, site: str) -> MetricValues:
+def _measure_authority(view: RunView, site: str) -> MetricValues:
     """Measures how much a user determines the motion of the slave arm.
 
     There are two metrics. The first is the weighted effort h sum_k a_k |tau_k|^2, in (N m)^2 s.
@@ -101,7 +101,7 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
     Returns:
         The metrics, by key. A metric without a value contains the reason.
     """
-    shared = view.compute_once(read_user_shares)
+    shared = view.compute_once(_read_user_shares)
     slave, users = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
@@ -203,7 +203,7 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     Quantity("takeover_s", "longest takeover", "s"),
     Quantity("lead_jump", "largest step of q_id while shares change, to that of the rest"),
 )
-def measure_sharing(view: RunView, _run: str) -> MetricValues:
+def _measure_sharing(view: RunView, _run: str) -> MetricValues:
     """Measures how the users of a slave arm disagree, intervene and take over.
 
     Each user moves a master arm, and the slave follows the masters with weights. The user with
@@ -217,7 +217,7 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
     Returns:
         The metrics, by key. A metric without a value contains the reason.
     """
-    shared = view.compute_once(read_user_shares)
+    shared = view.compute_once(_read_user_shares)
     slave, users = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)

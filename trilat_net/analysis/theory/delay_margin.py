@@ -54,7 +54,7 @@ frequency.
 """
 
 
-class AxisCrossing(NamedTuple):
+class _AxisCrossing(NamedTuple):
     """A crossing of the imaginary axis by one or more pairs of roots, as the delay increases.
 
     Attributes:
@@ -68,7 +68,7 @@ class AxisCrossing(NamedTuple):
     pairs: int
 
 
-class DelayInterval(NamedTuple):
+class _DelayInterval(NamedTuple):
     """An interval of common delays for which a loop is stable.
 
     Attributes:
@@ -80,8 +80,8 @@ class DelayInterval(NamedTuple):
 
     low_s: float
     high_s: float
-    low: AxisCrossing | None
-    high: AxisCrossing | None
+    low: _AxisCrossing | None
+    high: _AxisCrossing | None
 
     @property
     def description(self) -> str:
@@ -118,8 +118,8 @@ class DelayMargin(NamedTuple):
             imaginary axis for every delay.
     """
 
-    intervals: tuple[DelayInterval, ...]
-    crossings: tuple[AxisCrossing, ...]
+    intervals: tuple[_DelayInterval, ...]
+    crossings: tuple[_AxisCrossing, ...]
     lossless: bool = False
 
     @property
@@ -193,15 +193,15 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     unstable_roots = _count_unstable_roots(start_loop)
 
     # Walk through the crossings. Each one may end or begin a stable interval.
-    intervals: list[DelayInterval] = []
-    low: AxisCrossing | None = None
+    intervals: list[_DelayInterval] = []
+    low: _AxisCrossing | None = None
     low_s = 0.0
     stable = unstable_roots == 0
     for crossing in crossings:
         roots_per_pair = 2 if crossing.omega_rad_s else 1
         unstable_roots += roots_per_pair * crossing.pairs
         if stable and unstable_roots > 0:
-            interval = DelayInterval(low_s, crossing.delay_s, low, crossing)
+            interval = _DelayInterval(low_s, crossing.delay_s, low, crossing)
             intervals.append(interval)
             stable = False
         elif not stable and unstable_roots == 0:
@@ -210,7 +210,7 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
             stable = True
 
     if stable:
-        last_interval = DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
+        last_interval = _DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
         intervals.append(last_interval)
     return DelayMargin(tuple(intervals), tuple(crossings))
 
@@ -237,7 +237,7 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
     return count
 
 
-def _find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
+def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
     """Finds the delays, common to all links, at which roots cross the imaginary axis.
 
     The stability of a loop can change only at such delays.
@@ -275,9 +275,9 @@ def _find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
     return _merge_crossings(crossings), False
 
 
-def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
+def _merge_crossings(crossings: Sequence[_AxisCrossing]) -> list[_AxisCrossing]:
     """Sorts crossings, and merges those of equal delay and frequency into one."""
-    merged: list[AxisCrossing] = []
+    merged: list[_AxisCrossing] = []
     for crossing in sorted(crossings):
         if merged and _is_same_crossing(merged[-1], crossing):
             last = merged[-1]
@@ -288,7 +288,7 @@ def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
     return sorted(merged)
 
 
-def _is_same_crossing(last: AxisCrossing, crossing: AxisCrossing) -> bool:
+def _is_same_crossing(last: _AxisCrossing, crossing: _AxisCrossing) -> bool:
     """Returns True if two crossings differ in delay and frequency by rounding only."""
     delay_difference_s = abs(crossing.delay_s - last.delay_s)
     delay_tolerance_s = 1e-7 * (1e-3 + crossing.delay_s)
@@ -374,7 +374,7 @@ class _FrequencySweep:
         counts: NDArray[np.int64] = is_outside.sum(axis=1)
         return counts
 
-    def find_crossings(self, low: float, high: float) -> list[AxisCrossing]:
+    def find_crossings(self, low: float, high: float) -> list[_AxisCrossing]:
         """Finds where eigenvalues of the open-loop frequency response cross the unit circle.
 
         At the frequency w of a crossing, an eigenvalue of the response G(j w) has the modulus
@@ -413,7 +413,7 @@ class _FrequencySweep:
         pairs = int(ends[0] - ends[1])
         return self._list_delays(omega, pairs)
 
-    def _list_delays(self, omega: float, pairs: int) -> list[AxisCrossing]:
+    def _list_delays(self, omega: float, pairs: int) -> list[_AxisCrossing]:
         """Lists the delays at which roots are on the imaginary axis at a frequency.
 
         For each eigenvalue of modulus 1 these are the delays T with w T = phase + 2 pi k.
@@ -437,6 +437,6 @@ class _FrequencySweep:
                 angle = phase + full_turn * turn
                 delay_s = angle / omega
                 if 0.0 < delay_s <= MAX_COMMON_DELAY_S:
-                    crossing = AxisCrossing(delay_s, omega, sign)
+                    crossing = _AxisCrossing(delay_s, omega, sign)
                     crossings.append(crossing)
         return crossings

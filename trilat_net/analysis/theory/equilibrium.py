@@ -23,8 +23,8 @@ from ...core.step.ticks import BUCKETS_PER_S
 from ...core.step.vectors import Array
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.fused import FusedRun
+from ...own_code.imported_code import ImportedLaw
 from ...scenario import Scenario
-from ...scenario.imported_code import ImportedLaw
 from ...scenario.operators.kernel_operators import Chirp, Multisine
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop
@@ -133,7 +133,9 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
 
 
 @limit_blas_threads()
-def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
+def _find_nearest_equilibrium(
+    conditions: OperatingConditions, rest: Equilibrium
+) -> Equilibrium:
     """Finds the pose nearest to a given pose in which all arms rest.
 
     It is found by Gauss-Newton iteration. Each step is the smallest step that solves the
@@ -290,7 +292,7 @@ def _predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> 
         same_poses = np.tile(mean_pose, (len(q), 1))
         first_guess = start._replace(q=same_poses)
 
-    rest = find_nearest_equilibrium(conditions, first_guess)
+    rest = _find_nearest_equilibrium(conditions, first_guess)
     if conditions.has_forms:
         return rest._replace(how="the start poses")
 
@@ -301,7 +303,7 @@ def _predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> 
         if remaining is None:
             break
         shifted = _shift_equilibrium(conditions, rest, remaining)
-        rest = find_nearest_equilibrium(conditions, shifted)
+        rest = _find_nearest_equilibrium(conditions, shifted)
     return rest._replace(
         how="predicted from the start poses: the part of the start that the linear loop keeps"
     )
@@ -422,7 +424,7 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     residual = compute_equilibrium_residual(conditions, start)
     if float(np.abs(residual).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
         return start
-    nearest = find_nearest_equilibrium(conditions, start)
+    nearest = _find_nearest_equilibrium(conditions, start)
     return _require_equilibrium(scenario, nearest)
 
 
@@ -660,7 +662,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     estimates = _complete_estimates(conditions, theta_hat)
     start = Equilibrium(q, estimates, how, 0.0)
     start = _iterate_memories(conditions, start, 1)
-    nearest = find_nearest_equilibrium(conditions, start)
+    nearest = _find_nearest_equilibrium(conditions, start)
     return _require_equilibrium(scenario, nearest)
 
 
@@ -673,7 +675,7 @@ def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
             "the loop has no equilibrium near the end of the run "
-            f"(residual {rest.residual:.2g} rad/s^2); give a pose, as in --pose 0.1,0.3",
+            f"(residual {rest.residual:.2g} rad/s^2); `trilat linear --pose 0.1,0.3` takes one",
             source=scenario.name,
         )
     return rest

@@ -50,8 +50,8 @@ from scipy.linalg import block_diag, expm
 from ...core.step.site_setup import Law, Scheme, SiteSetup
 from ...core.step.vectors import Array, IntArray
 from ...scenario.delay_models import LinkBase
-from ...scenario.delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from ...scenario.sample_uses import draw_used_samples
+from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from .characteristic_roots import (
     NAMED_SHARE,
     ZERO_SHARE,
@@ -88,7 +88,7 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
     return exponential[:n, :n], exponential[:n, n:]
 
 
-class SiteTickMap(NamedTuple):
+class _SiteTickMap(NamedTuple):
     """Linear model of one site over one tick (period of its control loop): X' = P X + Q w.
 
     X contains the n states of the site at a tick, and X' the states at the next tick. w
@@ -110,7 +110,7 @@ class SiteTickMap(NamedTuple):
     names: tuple[str, ...]
 
 
-def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
+def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMap:
     """Builds the linear model of one site over one tick, from a model in continuous time.
 
     A site is a process that runs one arm, and a tick is one period of its control loop.
@@ -178,7 +178,7 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap
     output = np.zeros((3 * layout.coordinates, len(states)))
     output[:, : layout.states] = jacobian.output
     names = tuple(f"{site.name}.{state}" for state in states)
-    return SiteTickMap(P, Q, output, names)
+    return _SiteTickMap(P, Q, output, names)
 
 
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:

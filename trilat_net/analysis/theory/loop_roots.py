@@ -32,17 +32,18 @@ import numpy as np
 from ...core.links.philox import link_key
 from ...core.step.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.step.vectors import Array
-from ...errors import ScenarioError
+from ...errors import ScenarioError, join_words
 from ...execution.fused import FusedRun
 from ...execution.virtual import simulate_scenario
 from ...log.log_reader import Log
 from ...log.record_columns import Ints
+from ...own_code.imported_code import ImportedLaw
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay
-from ...scenario.delay_period import find_final_link, is_ending_trace
-from ...scenario.imported_code import ImportedLaw
 from ...scenario.sample_uses import draw_used_samples
+from ..delay_period import find_final_link, is_ending_trace
+from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
 from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s
@@ -67,7 +68,7 @@ _BATCH_RECORDS = 4096
 """Number of records of each site that are read from a simulated run at a time."""
 
 
-class EndLoop(NamedTuple):
+class _EndLoop(NamedTuple):
     """The control loop at the end of a run, with the rest about which it is linearised.
 
     Attributes:
@@ -83,6 +84,8 @@ class EndLoop(NamedTuple):
             the rest, in rad.
         last_pose: The last pose of the run. None if it is the rest. Arms that nobody holds may
             rest anywhere in between.
+        programs: Sites whose arms a program of the user moves. How it reacts to the arms is not
+            part of the linearised loop.
     """
 
     scenario: Scenario
@@ -92,6 +95,7 @@ class EndLoop(NamedTuple):
     has_mean_ages: bool
     distance_rad: float
     last_pose: Equilibrium | None = None
+    programs: tuple[str, ...] = ()
 
     def compute_sampled_roots(self, count: int) -> Spectrum | None:
         """Computes the rightmost roots of the loop with its ticks.
@@ -140,7 +144,7 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     return _compute_roots(loop)
 
 
-def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
+def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
     """Finds the control loop at the end of a recorded run, and the rest next to its end.
 
     Args:
@@ -179,10 +183,11 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
     if state is None:
         theta_hat = [site_log.theta_hat[-1] for site_log in site_logs]
         state = _choose_end_state(final.scenario, trace, theta_hat)
-    return _build_end_loop(final, state, trace, own_laws=own_laws)
+    loop = _build_end_loop(final, state, trace, own_laws=own_laws)
+    return loop._replace(programs=tuple(list_program_sites(log)))
 
 
-def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
+def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
     """Finds the control loop at the end of a simulated run, and the rest next to its end.
 
     The loop is that of a log of the same run. The code of imported control laws is executed.
@@ -228,7 +233,9 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
             columns = ended.layout(name).columns()
             theta_hat.append(record[columns["theta_hat"]])
         state = _choose_end_state(ended, trace, theta_hat)
-    return _build_end_loop(final, state, trace, own_laws=True)
+    loop = _build_end_loop(final, state, trace, own_laws=True)
+    programs = [site for site in scenario.names if has_program_hand(scenario, site)]
+    return loop._replace(programs=tuple(programs))
 
 
 def resolve_final_scenario(log: Log) -> Scenario:
@@ -280,7 +287,7 @@ class _EndState(NamedTuple):
 
 def _build_end_loop(
     final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
-) -> EndLoop:
+) -> _EndLoop:
     """Returns the final loop, with the equilibrium nearest to a state.
 
     Args:
@@ -299,7 +306,7 @@ def _build_end_loop(
     rest = follow_equilibrium(final.scenario, settle_memories(conditions, end))
     last_q = _find_last_angles(final.scenario, trace)
     distance_rad = float(np.abs(last_q - rest.q).max())
-    return EndLoop(
+    return _EndLoop(
         scenario=final.scenario,
         conditions=conditions,
         rest=rest,
@@ -310,7 +317,7 @@ def _build_end_loop(
     )
 
 
-def _compute_roots(loop: EndLoop) -> LoopRoots:
+def _compute_roots(loop: _EndLoop) -> LoopRoots:
     """Computes the rightmost roots of a loop, as a certificate states them.
 
     Args:
@@ -329,13 +336,33 @@ def _compute_roots(loop: EndLoop) -> LoopRoots:
             # The arms still move, and it is not known where in between they will rest.
             last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
             exact = _has_same_sign(sampled, last_roots)
+        # A program that reacts to the arms may make a loop unstable, or stable.
+        exact = exact and not loop.programs
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
-        return roots._replace(distance_rad=loop.distance_rad)
+        return roots._replace(
+            distance_rad=loop.distance_rad,
+            leaves_out=_name_left_out(loop.programs),
+            is_numerical=has_imported_law,
+        )
     continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
     basis = ", in continuous time"
     if loop.conditions.varying or loop.has_mean_ages:
         basis += ", of the mean ages"
-    return _describe_roots(continuous, basis, exact=False)
+    roots = _describe_roots(continuous, basis, exact=False)
+    return roots._replace(leaves_out=_name_left_out(loop.programs))
+
+
+def _name_left_out(programs: Sequence[str]) -> str:
+    """Returns which reactions the linearised loop leaves out, as a phrase. Empty if none.
+
+    Args:
+        programs: Sites whose arms a program of the user moves.
+    """
+    if not programs:
+        return ""
+    if len(programs) == 1:
+        return f"how the program at {programs[0]} reacts to the arms"
+    return f"how the programs at {join_words(programs)} react to the arms"
 
 
 def _has_same_sign(at_rest: Spectrum, at_last_pose: Spectrum | None) -> bool:

@@ -38,17 +38,17 @@ from ...core.step.vectors import Array
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
 from ...laws.conditions import LinearForm, LinearSituation
+from ...own_code.imported_code import ImportedLaw
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
-from ...scenario.delay_period import (
+from ...scenario.sample_uses import draw_used_samples
+from ...scenario.validate import refuse_external_arms
+from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
     find_link_period_s,
     is_ending_trace,
 )
-from ...scenario.imported_code import ImportedLaw
-from ...scenario.sample_uses import draw_used_samples
-from ...scenario.validate import refuse_external_arms
 from .numeric_law import NumericLaw
 from .site_dynamics import SiteRates, evaluate_site_rates
 
@@ -73,7 +73,7 @@ class Equilibrium(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-class EffectiveDelay(NamedTuple):
+class _EffectiveDelay(NamedTuple):
     """Age of the samples that a site uses, over its ticks.
 
     Attributes:
@@ -413,7 +413,7 @@ def compute_effective_delay(
     peer: str,
     site: str,
     link: LinkBase,
-) -> EffectiveDelay:
+) -> _EffectiveDelay:
     """Computes the age of a peer's samples at the ticks of a site that use them.
 
     The ages are those of the run. If the delay repeats after a longer time, they are those of a
@@ -438,7 +438,7 @@ def compute_effective_delay(
         whole_ticks = -(-delay_us * site_hz // 1_000_000)
         ticks = max(1, whole_ticks)
         age_s = ticks / site_hz
-        return EffectiveDelay(age_s, age_s, age_s)
+        return _EffectiveDelay(age_s, age_s, age_s)
 
     duration_s = scenario.duration_s
     if is_constant:
@@ -467,7 +467,7 @@ def compute_effective_delay(
     tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
     sample_ns = used[first:] * NS_PER_S // peer_hz
     ages_s = (tick_ns - sample_ns) * 1e-9
-    return EffectiveDelay(
+    return _EffectiveDelay(
         mean_s=float(ages_s.mean()),
         least_s=float(ages_s.min()),
         most_s=float(ages_s.max()),

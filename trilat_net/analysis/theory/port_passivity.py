@@ -378,7 +378,7 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
     return Y_kk - Y_kc @ holding
 
 
-class BestWeights(NamedTuple):
+class _BestWeights(NamedTuple):
     """Site weights that best prove the stability of coupled arms with passive operators.
 
     The operators act at ports, whose admittance Y maps their torques to velocities. There are N
@@ -396,7 +396,7 @@ class BestWeights(NamedTuple):
     weights: Array
 
 
-def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
+def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
     """Finds the site weights that best prove absolute stability, at each frequency.
 
     Each site (process that runs one arm) has one positive weight, which belongs to all its
@@ -458,7 +458,7 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     # the first site's weight is 1
     first_site = np.zeros((count, 1))
     log_weights = np.concatenate([first_site, best], axis=1)
-    return BestWeights(margin, np.exp(log_weights))
+    return _BestWeights(margin, np.exp(log_weights))
 
 
 def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:

@@ -133,7 +133,7 @@ def _add_axes(values: Numbers, shape: tuple[int, ...], count: int) -> Numbers:
     return values.reshape(*shape, *trailing)
 
 
-class PlacedLink(NamedTuple):
+class _PlacedLink(NamedTuple):
     """Pose and Jacobian of one link of an arm, for one or several poses of the arm.
 
     The arm has n joints. The axes "..." of the arrays stand for the poses. A spatial velocity
@@ -172,7 +172,7 @@ class PlacedChain:
         self._chain = chain
         self._q = q
         self._columns = q.shape[1:]
-        self._links: list[PlacedLink] = []
+        self._links: list[_PlacedLink] = []
 
         joints = len(q)
         columns = self._columns
@@ -190,7 +190,7 @@ class PlacedChain:
             place_m = place_m + offset_m
             R_base = _multiply(R_base, R)
 
-            link = PlacedLink(
+            link = _PlacedLink(
                 X=X,
                 S=S,
                 J=J,

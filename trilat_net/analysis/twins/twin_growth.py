@@ -50,11 +50,7 @@ from ...execution.twins import (
 from ...log.log_reader import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
-from ...scenario.delay_period import (
-    find_burst_interval_s,
-    find_final_delay_period,
-    find_final_link,
-)
+from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
 from ..run_end import RunEnd, classify_log_end, find_coupled_sites
 from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 
@@ -767,7 +763,7 @@ def _find_departures(
                 )
 
 
-class LinearSizes(NamedTuple):
+class _LinearSizes(NamedTuple):
     """The range of sizes for which the effect of a push is proportional to its size.
 
     A push is a small disturbance in a repetition of the run. Its size is in rad, in rad/s or in
@@ -801,7 +797,7 @@ class PushedTwins(Result):
     log: Log
     at_s: float
     growth: TwinGrowth
-    linear: LinearSizes | None = None
+    linear: _LinearSizes | None = None
 
     def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence for the user on whether the effect of a push grows or dies away.
@@ -978,7 +974,7 @@ def _find_linear_sizes(
     scenario: Scenario,
     growth: TwinGrowth,
     sizes: Sequence[float],
-) -> LinearSizes:
+) -> _LinearSizes:
     """Finds the sizes of a push up to which its effect is proportional to its size.
 
     Two pushes of neighbouring sizes are compared at all times. Their effect is proportional if
@@ -1022,7 +1018,7 @@ def _find_linear_sizes(
     text = f"not linear, from {largest_linear:g} {unit} on"
     if largest_linear > sizes[0]:
         text = f"linear from {sizes[0]:g} to {largest_linear:g} {unit}"
-    return LinearSizes(sizes[0], largest_linear, text + beyond)
+    return _LinearSizes(sizes[0], largest_linear, text + beyond)
 
 
 def _has_wall(scenario: Scenario) -> bool:

@@ -15,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from ...entry_points import find_viewer
 from ...errors import UsageError, count_nouns
 from ...presentation import terminal_output as terminal
 from ...presentation.exports import list_export_formats
@@ -211,6 +212,10 @@ def log_view_command(
             help="Write a configuration of RViz next to FILE instead, for its ROS 2 topics.",
         ),
     ] = False,
+    viewer: Annotated[
+        str | None,
+        options.value("--in", "NAME", "Open the log in a viewer that another package adds."),
+    ] = None,
     force: options.ForceOption = False,
 ) -> None:
     """Opens a log in Rerun, with a column for each site and a label for every curve.
@@ -223,6 +228,11 @@ def log_view_command(
 
     from ...files import stage_output
     from ...presentation.rerun_viewer import ViewerOptions, open_rerun
+
+    if viewer is not None:
+        if full or web or save or foxglove or rviz or force:
+            raise UsageError("--in cannot be combined with another option")
+        return find_viewer(viewer)(files)
 
     if foxglove or rviz:
         if full or web or save:

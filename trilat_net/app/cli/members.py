@@ -106,116 +106,6 @@ def site_command(
     raise typer.Exit(run_site(chosen, name, site_options, terminal.print_line))
 
 
-@options.command(
-    "m2 --scenario my_run.toml",
-    "m1 --session play --device haply_inverse3",
-    page="docs/sessions/devices.md",
-)
-def hand_command(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
-    scenario: Annotated[
-        str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
-    ] = "",
-    session: Annotated[str | None, value("--session", "ID")] = None,
-    join_timeout: Annotated[
-        float, seconds("--join-timeout", "Longest wait for the site, s.")
-    ] = 60.0,
-    duration: options.DurationOption = None,
-    seed: options.SeedOption = None,
-    overrides: options.SetOption = None,
-    device: Annotated[str | None, value("--device", "NAME[=ADDRESS]")] = None,
-    *,
-    reach: options.Reach,
-) -> None:
-    """Runs your program, or a device that you hold, as a user.
-
-    A hand acts as the user of a site. A class of your own (kind = "own", process = true) runs
-    in this process: it reads the state of the site and decides how to move the arm, and the
-    site applies each decision after the hand's delay_ms. A device (kind = "live") leads an arm
-    of a session that is already running.
-
-    Options:
-        name: Name of the site in the scenario.
-        scenario: For a class: scenario that the site runs, as the name of a shipped scenario or
-            the path of a TOML file.
-        session: Name of the session; required with --device, otherwise the default is the name
-            of the scenario.
-        device: Device in your hand: haply_inverse3 or spacemouse. The scenario of the session
-            defines how the device leads the arm.
-    """
-    if device is not None:
-        scenario_options = {"--scenario", "--duration", "--seed", "--set"}
-        extra = scenario_options & set(options.list_used_options(context))
-        if extra:
-            raise UsageError(
-                f"--device leads an arm of a running session: leave out {min(extra)}"
-            )
-        return _lead_by_device(
-            device=device, name=name, session=session, reach=reach, timeout_s=join_timeout
-        )
-    if not scenario:
-        raise UsageError(
-            "a class of your own needs --scenario; a device that you hold needs --device"
-        )
-    from sites.hand_process import run_hand
-
-    from ...net.connection import default_endpoints
-    from ...net.zenoh_config import OPERATOR
-    from ...scenario import find_site
-
-    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
-    session_name = options.check_session_name(session or chosen.name)
-    endpoints = default_endpoints(session_name, chosen.names, encrypted=reach.keys is not None)
-    find_site(chosen, name)
-    member = options.MemberOptions(None, *reach)
-    connection = member.resolve((), [endpoints[name]]).require(OPERATOR)
-    with Interrupt() as interrupt:
-        run_hand(
-            scenario=chosen,
-            name=name,
-            session=session_name,
-            connection=connection,
-            interrupt=interrupt,
-            say=terminal.print_line,
-            timeout_s=join_timeout,
-        )
-    if interrupt.is_requested():
-        raise typer.Exit(interrupt.exit_code)
-    return None
-
-
-def _lead_by_device(
-    device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
-) -> None:
-    """Lets the user lead an arm of a running session with an input device.
-
-    The function returns when the session ends, or at Ctrl-C.
-
-    Args:
-        device: Name of the device, and its address if needed, as in NAME=ADDRESS.
-        name: Name of the site whose arm is led.
-        session: Name of the session.
-        reach: The options by which the command reaches the session.
-        timeout_s: Longest wait for the site, in s.
-    """
-    from sites.devices import open_device
-    from trilat_net.app.running_session import RunningSession
-
-    running = RunningSession(options.check_session_name(session or ""), reach.resolve())
-    opened_device = open_device(device)
-    with Interrupt() as interrupt:
-        running.lead(
-            name,
-            opened_device,
-            stopped=interrupt.is_requested,
-            say=terminal.print_line,
-            timeout_s=timeout_s,
-        )
-    if interrupt.is_requested():
-        raise typer.Exit(interrupt.exit_code)
-
-
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
     """Checks the sites without which a session may begin.
 
@@ -289,13 +179,13 @@ def record_command(
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder.record_process import record_session
-    from sites.machine_load import describe_load, measure_busy_share
+    from sites.machine_load import check_machine_load
 
     from ...files import refuse_existing
     from ...log.log_layout import find_parts, parse_channel_filter
     from ...log.log_writer import LogStorage, parse_split
     from ...log.provenance import collect_provenance
-    from ...log.ros2.viz_channels import parse_viz_rate
+    from ...log.view_rates import parse_viz_rate
     from ...net.topics import RECORDER
     from ..recorded_session import make_scenario_reader
 
@@ -324,7 +214,7 @@ def record_command(
 
     def warn_of_load() -> None:
         """Warns if other programs keep the processors of this machine busy."""
-        warning = describe_load(measure_busy_share(clock))
+        warning = check_machine_load(clock)
         if warning:
             terminal.print_note(warning)
 

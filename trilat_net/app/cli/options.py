@@ -681,46 +681,6 @@ class RunOptions(NamedTuple):
         return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
 
 
-class PageServing(NamedTuple):
-    """The options of a command that serves a page to browsers."""
-
-    host: Annotated[
-        str,
-        value(
-            "--host",
-            "ADDRESS",
-            "Address on which the page is served; any address other than loopback requires "
-            "--tls or --insecure.",
-        ),
-    ] = "127.0.0.1"
-    port: Annotated[
-        int,
-        typer.Option(
-            "--port",
-            min=0,
-            max=65535,
-            help="Port on which the page is served; 0 selects any free port.",
-        ),
-    ] = 0
-    insecure: Annotated[
-        bool, flag("--insecure", "Allow a --host other than loopback without encryption.")
-    ] = False
-    browser: Annotated[
-        bool,
-        flag(
-            "--browser/--no-browser",
-            "Open the page in a browser, if this machine has a browser.",
-        ),
-    ] = True
-    tls: Annotated[
-        Path | None,
-        value("--tls", "DIR", "Encrypt the page with the member's keys in this folder."),
-    ] = None
-
-
-_OPTION_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
-
-
 def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
     """Makes a command for Typer from a function whose parameters are groups of options.
 
@@ -738,7 +698,7 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
     tuples = {
         name: parameter.annotation
         for name, parameter in declared.items()
-        if parameter.annotation in _OPTION_TUPLES
+        if hasattr(parameter.annotation, "_fields")
     }
 
     parameters = []

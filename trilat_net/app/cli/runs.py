@@ -46,8 +46,8 @@ def sim_command(
     It writes the same kind of log as a live session.
     """
     from ...execution.virtual import record_virtual
-    from ...log.ros2.viz_channels import parse_viz_rate
-    from ...scenario.code_consent import find_user_laws
+    from ...log.view_rates import parse_viz_rate
+    from ...own_code.code_consent import find_user_laws
     from ...scenario.validate import write_simulated_options
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -92,6 +92,8 @@ def sim_command(
         report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(files))}"
         terminal.print_text(f"next: {report}")
 
+    for failure in open_log(path).failed_hands:
+        terminal.print_note(failure)
     if not stayed_in_limits:
         remedy = ""
         if any(spec.arm.urdf for spec in chosen.sites.values()):

@@ -6,10 +6,10 @@ sites over the same network.
 """
 
 import re
-from contextlib import suppress
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
@@ -22,7 +22,6 @@ from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from live.page_server import PageAttendant
     from trilat_net.app.running_session import RunningSession
 
     from ...scenario import Scenario
@@ -36,7 +35,19 @@ def demo_command(
 
     Each site runs in its own process, and so does the recorder; they communicate over Zenoh.
     """
-    _run_and_report(run.load(scenario), run)
+    run_and_report(run.load(scenario), run)
+
+
+class _SessionPage(Protocol):
+    """A page in a browser that shows a session, and offers its results afterwards."""
+
+    def attend(
+        self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
+    ) -> AbstractContextManager[Callable[[], bool]]:
+        """Shows the session while it runs, see `SessionAttendant`."""
+
+    def offer_results(self, paths: Iterable[Path]) -> None:
+        """Offers the report and the log to those who look at the page."""
 
 
 def _describe_log(path: Path) -> str:
@@ -58,8 +69,8 @@ def _describe_log(path: Path) -> str:
     return ""
 
 
-def _run_and_report(
-    chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None
+def run_and_report(
+    chosen: "Scenario", run: options.RunOptions, page: "_SessionPage | None" = None
 ) -> None:
     """Runs a scenario live, then verifies its log and writes a report.
 
@@ -107,74 +118,6 @@ def _run_and_report(
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)
 
-
-@options.command("play", "--session paper", page="docs/sessions/live-page.md")
-def live_command(
-    context: typer.Context,
-    scenario: options.ScenarioArgument = "play",
-    session: Annotated[str | None, value("--session", "ID")] = None,
-    *,
-    reach: options.Reach,
-    serving: options.PageServing,
-    run: options.RunOptions,
-) -> None:
-    """Runs a scenario live on a web page, where you lead the arms.
-
-    A button on the page or Ctrl-C ends the session; then its log is verified and a report is
-    written. With --session, the page shows a session that is already running, and leaves it
-    running.
-
-    Options:
-        session: Show this running session instead of starting one.
-    """
-    from live.page_server import MAX_DURATION_S, PageAttendant, PageOptions, show_on_page
-    from live.terminal_watch import watch_session
-
-    clock = SystemClock()
-    say = terminal.print_line
-    page = PageOptions(*serving)
-    page.check()
-
-    if session is not None:
-        extra = _START_OPTIONS & set(options.list_used_options(context))
-        if extra:
-            raise UsageError(
-                "--session shows a session that is already running: "
-                f"leave out {', '.join(sorted(extra))}"
-            )
-        connection = reach.resolve()
-        name = options.check_session_name(session)
-        show = partial(show_on_page, page, clock, name, say)
-        raise typer.Exit(
-            watch_session(
-                session=name,
-                connection=connection,
-                clock=clock,
-                show=show,
-                say=say,
-                timeout_s=10.0,
-            )
-        )
-
-    if any(reach):
-        raise UsageError(
-            "--connect, --router, --zenoh-config and --keys can be used only with --session"
-        )
-    with PageAttendant(page, clock) as attendant:
-        _run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
-
-
-_START_OPTIONS = {
-    "--duration",
-    "--out",
-    "--seed",
-    "--set",
-    "--force",
-    "--png",
-    "--json",
-    "scenario",
-}
-"""Options of `trilat live` that only concern a session that it starts."""
 
 _check_count = options.check_range(5, 10_000, "a number")
 
@@ -445,41 +388,6 @@ def _run_far_end(
         raise typer.Exit(interrupt.exit_code)
 
 
-@options.command("--session paper", page="docs/sessions/live-page.md")
-def watch_command(
-    session: Annotated[str, value("--session", "ID", "Session to watch.")],
-    *,
-    as_site: Annotated[
-        str, value("--as", "SITE", "Show only the view of this site's user.")
-    ] = "",
-    reach: options.Reach,
-    timeout: options.AnswerOption = 10.0,
-) -> None:
-    """Shows a running session in the terminal.
-
-    The command ends with the session or with Ctrl-C. Each site has a line with its joint
-    angles, the size |e| of its synchronisation error, its torque and mode, the age of the
-    newest sample of each peer, and the holder of the arm. The line above the sites shows V, the
-    energy function of the stability proof. Without endpoints, the command connects to the
-    loopback port of the first site and asks for the other sites.
-    """
-    from live.terminal_watch import show_in_terminal, watch_session
-
-    name = options.check_session_name(session)
-    clock = SystemClock()
-    show = partial(show_in_terminal, clock, name, as_site, terminal.out)
-    raise typer.Exit(
-        watch_session(
-            session=name,
-            connection=reach.resolve(),
-            clock=clock,
-            show=show,
-            say=terminal.print_line,
-            timeout_s=timeout,
-        )
-    )
-
-
 SessionOption = Annotated[str, value("--session", "ID", "Name of the session.")]
 SitesArgument = Annotated[
     list[str] | None,
@@ -717,8 +625,8 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     """
     from trilat_net.app.running_session import RunningSession
 
-    from ...fields import check_finite
     from ...net.requests import ChangeRequest
+    from ...scenario.key_checks import check_finite
 
     session, connection = context.obj
     check_finite(change, "")  # messages cannot hold infinite numbers

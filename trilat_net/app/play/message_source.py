@@ -48,7 +48,7 @@ and above other processes.
 """
 
 
-class RoundEnd(NamedTuple):
+class _RoundEnd(NamedTuple):
     """States that the messages of a round have ended, in the stream from the reader process.
 
     A round is one pass through the log. A log that is played in a loop has several rounds.
@@ -63,7 +63,7 @@ class RoundEnd(NamedTuple):
     torn: dict[Path, str]
 
 
-class ReadPiece(NamedTuple):
+class _ReadPiece(NamedTuple):
     """Piece of a log that the reader process sends to the player.
 
     Attributes:
@@ -103,7 +103,7 @@ class MessageSource:
         self._batch = batch
         # Items that were fetched in advance and not returned yet: pieces of the log, the end of
         # a round, or the error that ended the reading.
-        self._ahead: deque[ReadPiece | RoundEnd | LogError] = deque()
+        self._ahead: deque[_ReadPiece | _RoundEnd | LogError] = deque()
         # Size of the payloads in these pieces, in bytes.
         self._ahead_bytes = 0
         # Bytes of the pipe that do not form a complete item yet.
@@ -152,13 +152,13 @@ class MessageSource:
         item = self._ahead.popleft()
         if isinstance(item, LogError):
             raise item
-        if isinstance(item, ReadPiece):
+        if isinstance(item, _ReadPiece):
             # The list is changed in place, because others refer to the same header.
             self._header.topics[:] = item.topics
             self._ahead_bytes -= len(item.batch.data)
             return item.batch
 
-        round_end: RoundEnd = item
+        round_end: _RoundEnd = item
         self.strays += round_end.strays
         self._header.torn.update(round_end.torn)
         self.ended = True
@@ -203,15 +203,15 @@ class MessageSource:
             item = pickle.loads(self._received[SIZE.size : end])
             del self._received[:end]
             self._ahead.append(item)
-            if isinstance(item, ReadPiece):
+            if isinstance(item, _ReadPiece):
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
         """Supplies the messages again from the first one, when a log is played in a loop."""
         self.ended = False
         if self._batch is not None:
-            self._ahead.append(ReadPiece(self._header.topics, self._batch))
-            self._ahead.append(RoundEnd(0, {}))
+            self._ahead.append(_ReadPiece(self._header.topics, self._batch))
+            self._ahead.append(_RoundEnd(0, {}))
 
     def close(self) -> None:
         """Ends the reader process, if there is one. Further calls have no effect."""
@@ -346,7 +346,7 @@ def feed_player(
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
-    def send(item: ReadPiece | RoundEnd | LogError) -> None:
+    def send(item: _ReadPiece | _RoundEnd | LogError) -> None:
         """Writes an item to the pipe, and waits until there is room."""
         pickled = pickle.dumps(item)
         sink.write(SIZE.pack(len(pickled)) + pickled)
@@ -365,8 +365,8 @@ def feed_player(
                     strays += batch_strays
                     for piece in batch.pieces():
                         assert reader.header is not None  # there was a message
-                        send(ReadPiece(reader.header.topics, piece.compact()))
-                send(RoundEnd(strays, reader.header.torn if reader.header else {}))
+                        send(_ReadPiece(reader.header.topics, piece.compact()))
+                send(_RoundEnd(strays, reader.header.torn if reader.header else {}))
                 if not loop:
                     return
         except LogError as error:

@@ -271,7 +271,7 @@ def rotate(R: Array, a: Three) -> Three:
 
 
 @leaf
-def rotate_back(R: Array, a: Three) -> Three:
+def _rotate_back(R: Array, a: Three) -> Three:
     """Returns the product R' a, the vector `a` rotated by the inverse of R.
 
     Args:
@@ -357,8 +357,8 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
     p = three(row.p)
     turning_velocity = cross(angular, p)
     velocity_at_p = add(linear, turning_velocity)
-    link_linear = rotate_back(row.R, velocity_at_p)
-    link_angular = rotate_back(row.R, angular)
+    link_linear = _rotate_back(row.R, velocity_at_p)
+    link_angular = _rotate_back(row.R, angular)
     axis = three(row.axis)
     joint_velocity = scale(rate, axis)
     if row.prismatic == 0:

@@ -74,32 +74,6 @@ def theta_from_links(links: ArmLinks) -> Array:
     return np.array([theta_1, theta_2, theta_3, theta_4, theta_5])
 
 
-def is_positive_definite(theta: Array) -> bool:
-    """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
-
-    Otherwise the parameters describe no real arm. With the angle q2 of the second joint, the
-    inertia matrix is
-
-        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
-            | theta_3 + theta_2 cos(q2)      theta_3                   |
-
-        det M = theta_1 theta_3 - theta_3^2 - theta_2^2 cos(q2)^2
-
-    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked. The
-    check has a margin for rounding.
-
-    Args:
-        theta: Dynamic parameters of the arm, shape (5,), see `theta_from_links`. The first
-            three are inertias, kg m^2.
-    """
-    theta_1 = theta[0]
-    theta_2 = theta[1]
-    theta_3 = theta[2]
-    least_determinant = theta_1 * theta_3 - theta_3**2 - theta_2**2
-    margin = 1e-9 * theta_1 * theta_3
-    return bool(theta_3 > 0.0 and least_determinant > margin)
-
-
 @leaf
 def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
     """Returns the inertia matrix M(q) of the arm, two rows, kg m^2.

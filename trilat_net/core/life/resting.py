@@ -77,7 +77,7 @@ def rests(site: SiteRow) -> bool:
 
 
 @leaf
-def find_brake_ratio(site: SiteRow) -> float:
+def _find_brake_ratio(site: SiteRow) -> float:
     """Returns how far the brake of the arm exceeds what its torque limits permit.
 
     This is the largest ratio of B |qd| to the torque limit over the joints, where B is the
@@ -92,12 +92,12 @@ def find_brake_ratio(site: SiteRow) -> float:
 
 
 @leaf
-def is_fast(site: SiteRow) -> bool:
+def _is_fast(site: SiteRow) -> bool:
     """Returns True if the damping B of some joint alone would exceed its torque limit.
 
     The torque of the damping is B |qd|, where qd is the velocity of the joint.
     """
-    fast: bool = find_brake_ratio(site) > 1.0
+    fast: bool = _find_brake_ratio(site) > 1.0
     return fast
 
 
@@ -112,13 +112,13 @@ def rests_by_law(site: SiteRow) -> bool:
       without the motion of other arms.
     - The law works in task space, and is not the built-in law that knows the gravity torque.
     - The law computed a number that is not finite.
-    - The arm is too fast, see `is_fast`.
+    - The arm is too fast, see `_is_fast`.
     """
     holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
     failed = site.reason == _NOT_FINITE
     usable = holds and not learns_in_task and not failed
-    return bool(usable and not is_fast(site))
+    return bool(usable and not _is_fast(site))
 
 
 @leaf
@@ -213,7 +213,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
     factor = 0.0
     if remaining_s > step_s + _ROUNDING_S:
         factor = 1.0 - step_s / remaining_s
-    fast = is_fast(site)
+    fast = _is_fast(site)
     for i in range(site.joints):
         qd = site.qd[i]
         q_ref, rate_before = _read_rest_reference(site, i)
@@ -250,7 +250,7 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
             rest.
     """
     elapsed_ns = t_ns - site.return_from_ns
-    brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
+    brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or _is_fast(site)
     for i in range(site.joints):
         _, reference_velocity = _read_rest_reference(site, i)
         brakes = brakes or reference_velocity != 0.0
@@ -332,7 +332,7 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     # The part of an unexplained torque that is kept, smaller for a faster arm.
     kept_part = 0.0
     if k > site.first:
-        kept_part = max(0.0, 1.0 - find_brake_ratio(site))
+        kept_part = max(0.0, 1.0 - _find_brake_ratio(site))
     for i in range(site.joints):
         qd = site.qd[i]
         damping = site.damping[i]

@@ -292,7 +292,7 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 
 @leaf
-def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
+def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
     """Returns True if the last sample of some peer that the site follows is too old.
 
     A peer from which no sample is in use counts as if its last sample were of the epoch, the
@@ -333,7 +333,7 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return
-    stale = any_peer_stale(t_ns, site.stale_ns, links)
+    stale = _any_peer_stale(t_ns, site.stale_ns, links)
     follows = site.mode == _RUN or site.mode == _RETURN
     stopped = site.mode == _HOLD or site.mode == _BRAKE
     if stale and follows:

@@ -17,6 +17,7 @@ import hashlib
 import re
 from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -26,7 +27,7 @@ from numba.core import types
 from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
-from ...errors import LawFailed, ScenarioError
+from ...errors import LawFailed, ScenarioError, suggest_nearest
 from ..links.link import ChannelArrays
 from ..step.control import limit_torque
 from ..step.jit import bind_leaf, compile_named, leaf
@@ -39,6 +40,7 @@ from .plugged import call_address, digest_sibling_sources, find_address
 from .user_law import (
     LawInput,
     LawResults,
+    PeerView,
     check_results,
     describe_failure,
     law_name,
@@ -349,6 +351,13 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
     return numbers_by_name
 
 
+_INPUTS = {
+    "LawInput": ("now", LawInput._fields),
+    "Record(alpha": ("an entry of now.peers", PeerView._fields),
+}
+"""Names and fields of the inputs of a law, by the beginning of their types in Numba."""
+
+
 def _explain(error: Exception, law: Any) -> str:
     """Returns a sentence that says which part of a law Numba cannot compile.
 
@@ -369,7 +378,12 @@ def _explain(error: Exception, law: Any) -> str:
             f"the law creates an array or a list{location}: compute number by number, as in "
             "now.tau[i] = -now.qd[i]; create lists in __init__, and let torque write into them"
         )
+    field = re.search(r"Unknown attribute '(\w+)' of type (LawInput|Record\(alpha)", text)
+    if field:
+        return _explain_field(field[1], field[2], location)
     attribute = re.search(r"Unknown attribute '(\w+)' of type Record", text)
+    if isinstance(error, KeyError) and not _reads_own_attribute(law, error.args[0]):
+        return _explain_field(error.args[0], "Record(alpha", location)
     if isinstance(error, KeyError):
         return _explain_attribute(error.args[0], law, location)
     if attribute:
@@ -385,6 +399,34 @@ def _explain(error: Exception, law: Any) -> str:
     noise = ("Failed in", "File", "During", "-", "^", "<", "[")
     sentences = [line for line in lines if not line.startswith(noise)]
     return f"{(sentences or lines)[0].rstrip('.:')}{location}"
+
+
+def _reads_own_attribute(law: Any, name: str) -> bool:
+    """Returns True if the method `torque` of a law reads an attribute of the law itself.
+
+    Args:
+        law: An instance of the law's class.
+        name: Name of the attribute.
+    """
+    instructions = list(dis.get_instructions(type(law).torque))
+    own_name = type(law).torque.__code__.co_varnames[0]
+    return any(
+        loaded.argval == own_name and read.argval == name
+        for loaded, read in pairwise(instructions)
+    )
+
+
+def _explain_field(name: str, kind: str, location: str) -> str:
+    """Returns a sentence that says that an input of a law has no such field.
+
+    Args:
+        name: Name of the field.
+        kind: The input, a key of `_INPUTS`.
+        location: Line of the law, as in " (line 12)"; empty if unknown.
+    """
+    subject, names = _INPUTS[kind]
+    nearest = suggest_nearest(name, names) or f"; it has {', '.join(names)}"
+    return f"{subject} has no field {name}{location}{nearest}"
 
 
 def _explain_attribute(name: str, law: Any, location: str) -> str:

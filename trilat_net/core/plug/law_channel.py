@@ -41,7 +41,7 @@ class SentVector(NamedTuple):
     per_peer: bool = False
 
 
-class SentEntry(NamedTuple):
+class _SentEntry(NamedTuple):
     """One number that a law sends.
 
     Attributes:
@@ -137,7 +137,7 @@ class LawChannel(NamedTuple):
                 columns.append(starts[vector.name] + n if is_sent else -1)
         return columns
 
-    def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
+    def entries(self, peers: Sequence[str]) -> Iterator[_SentEntry]:
         """Describes each number that the law sends in a period of the control loop.
 
         The numbers are in the order of the field `ch` of a record, which stores them.
@@ -155,7 +155,7 @@ class LawChannel(NamedTuple):
         for peer, vectors in groups:
             for vector in vectors:
                 for n in range(vector.length):
-                    yield SentEntry(vector, peer, n)
+                    yield _SentEntry(vector, peer, n)
 
     def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
         """Returns those of the sent numbers that one peer receives.

@@ -555,7 +555,7 @@ class _LaneCompiler(_LeafCompiler):
     has_distinct_arguments = True
 
 
-def is_in_lanes(numba_type: Any) -> bool:
+def _is_in_lanes(numba_type: Any) -> bool:
     """Returns True if a value is a row of several runs side by side, or contains such values.
 
     Args:
@@ -563,10 +563,10 @@ def is_in_lanes(numba_type: Any) -> bool:
             `in_lanes`.
     """
     if isinstance(numba_type, types.Array):
-        return is_in_lanes(numba_type.dtype)
+        return _is_in_lanes(numba_type.dtype)
     if isinstance(numba_type, types.BaseTuple):
         entry_types: Any = numba_type
-        return any(map(is_in_lanes, entry_types.types))
+        return any(map(_is_in_lanes, entry_types.types))
     return bool(getattr(numba_type, "in_lanes", False))
 
 
@@ -594,7 +594,7 @@ class _Leaf(CPUDispatcher):
 
         Numba calls this method.
         """
-        if self.choose_lane_form is not None and any(map(is_in_lanes, arguments)):
+        if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)
         return self.py_func
 
@@ -661,7 +661,7 @@ class _Leaf(CPUDispatcher):
             # A compiled caller can use machine code and LLVM code alike.
             if known is None:
                 # Rows in lanes are defined outside of the core, whose hash names the cache.
-                is_stored = not any(map(is_in_lanes, argument_types))
+                is_stored = not any(map(_is_in_lanes, argument_types))
                 if is_stored:
                     known = self._cache.load_inner(argument_types, self.targetctx)
                 if known is None:

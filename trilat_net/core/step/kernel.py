@@ -408,7 +408,7 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 
 @leaf
-def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
+def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
     """Returns the arrays of the link from one peer, as views of the arrays of the site.
 
     A site is the process that runs one arm, and a peer another site that sends its samples
@@ -447,7 +447,7 @@ def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
         The number of the period if the sample arrives in time. LOST if the link loses the
         sample, or if the sample is too old.
     """
-    return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
+    return release_tick(tick, arrays.site[0].rate_hz, _link_arrays(arrays, peer))
 
 
 @leaf
@@ -474,7 +474,7 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
             qd=arrival.qd,
             tau_x=buffers.forces[n],
             sent=buffers.sent[n],
-            link=link_arrays(arrays, arrival.peer),
+            link=_link_arrays(arrays, arrival.peer),
         )
 
 
@@ -565,12 +565,12 @@ def sense_stages(
     # same page would use their samples.
     for missed in range(k - arrays.site[0].skipped, k):
         for j in range(arrays.links.shape[0]):
-            release_sample(missed, rate_hz, link_arrays(arrays, j))
+            release_sample(missed, rate_hz, _link_arrays(arrays, j))
     # 1 accept
     accept_stage(k, count, arrays, buffers)
     # 2 release
     for j in range(arrays.links.shape[0]):
-        release_sample(k, rate_hz, link_arrays(arrays, j))
+        release_sample(k, rate_hz, _link_arrays(arrays, j))
     # 3 reference, 4 errors, 5 estimate
     reference_stages(
         k=k,

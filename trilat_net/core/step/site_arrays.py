@@ -385,7 +385,7 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     site.ramps = count + 1
 
 
-def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
+def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     """Adds a planned change of a link's delay and loss to the table of changes.
 
     The table is sorted by the time from which a change applies.
@@ -453,7 +453,7 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
         largest_count = arrays.models.shape[1]
         if link.models >= largest_count:
             raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
-        add_model(arrays, change.peer, change.model)
+        _add_model(arrays, change.peer, change.model)
     if change.ramp is not None:
         # Remove the ramps that are over, to have room for the new one.
         s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)

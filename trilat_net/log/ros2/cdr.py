@@ -352,7 +352,7 @@ def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
     return _HEAD + data
 
 
-class CdrReader:
+class _CdrReader:
     """Decodes a ROS 2 message field by field, in the order of its definition.
 
     Every call of a method returns the next field. All methods raise a ValueError if the message
@@ -449,7 +449,7 @@ def read_joint_state(payload: bytes) -> RosJoints:
     Raises:
         ValueError: The message cannot be decoded.
     """
-    reader = CdrReader(payload)
+    reader = _CdrReader(payload)
     stamp_ns, _ = reader.header()
     names = [reader.text() for _ in range(reader.count())]
     return RosJoints(
@@ -467,7 +467,7 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
     Raises:
         ValueError: The message cannot be decoded.
     """
-    reader = CdrReader(payload)
+    reader = _CdrReader(payload)
     # Each dimension has a label, a size and a stride; the offset of the data follows.
     for _ in range(reader.count()):
         reader.text()
@@ -493,6 +493,6 @@ def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ..
     Raises:
         ValueError: The message cannot be decoded.
     """
-    reader = CdrReader(payload)
+    reader = _CdrReader(payload)
     _, frame = reader.header()
     return frame, reader.numbers("d", count)

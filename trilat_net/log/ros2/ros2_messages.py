@@ -172,7 +172,7 @@ def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
     yield LINES, log_line
 
 
-class ArrayChannel:
+class _ArrayChannel:
     """A channel for viewers whose messages are arrays of a fixed shape.
 
     The messages have the ROS type `std_msgs/msg/Float64MultiArray`.
@@ -206,7 +206,7 @@ class ArrayChannel:
         self.pack = cdr.make_float_array_packer(*dimensions)
 
 
-ArrayChannels = dict[str, ArrayChannel]
+ArrayChannels = dict[str, _ArrayChannel]
 """Array channels by the last part of their topic."""
 
 
@@ -254,47 +254,49 @@ class Ros2SiteChannels:
         self.record_arrays = ("error", *self._slow_names)
         self.arrays = {
             "error": self._make_error_array(),
-            "tau_x": ArrayChannel(
+            "tau_x": _ArrayChannel(
                 "exogenous torque, as Eq. (8) subtracts it",
                 self._join_units("N m"),
                 _make_labels(self.joints),
             ),
             "theta_hat": self._make_estimate_array(),
             **sent_arrays,
-            "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
+            "mode": _ArrayChannel(
+                "run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]
+            ),
             **self._make_statistics_arrays(),
         }
 
-    def _make_error_array(self) -> ArrayChannel:
+    def _make_error_array(self) -> _ArrayChannel:
         """Returns the array of the synchronisation error, of a pose or of the joints."""
         if self._arm.shares_pose:
             shared = self._arm.counts.shared
             axes = TASK_AXES[:shared]
-            return ArrayChannel("x - x_des", "m or rad", axes)
+            return _ArrayChannel("x - x_des", "m or rad", axes)
         units = self._join_units("rad")
         labels = _make_labels(self.joints)
-        return ArrayChannel("q - q_des", units, labels)
+        return _ArrayChannel("q - q_des", units, labels)
 
-    def _make_estimate_array(self) -> ArrayChannel:
+    def _make_estimate_array(self) -> _ArrayChannel:
         """Returns the array of the estimated parameters of the arm."""
         labels = _make_labels(name for name, _ in self._arm.parameters)
         if self._arm.chain is not None:
-            return ArrayChannel("estimate", "kg, kg m, kg m^2", labels)
+            return _ArrayChannel("estimate", "kg, kg m, kg m^2", labels)
         units = "kg m^2, kg m^2, kg m^2, kg m, kg m"
-        return ArrayChannel("estimate of Eq. (24)", units, labels)
+        return _ArrayChannel("estimate of Eq. (24)", units, labels)
 
     def _make_statistics_arrays(self) -> ArrayChannels:
         """Returns the arrays that are computed from the statistics of links."""
         peers = self._peers
         return {
-            "link_age": ArrayChannel("age of the sample in use", "ms", peers),
-            "link_delay": ArrayChannel(
+            "link_age": _ArrayChannel("age of the sample in use", "ms", peers),
+            "link_delay": _ArrayChannel(
                 "one-way delay, last 100 ms", "ms", peers, ("median", "max")
             ),
-            "link_offset": ArrayChannel(
+            "link_offset": _ArrayChannel(
                 "the peer's clock minus the own one", "ms", peers, ("offset", "bound")
             ),
-            "timing": ArrayChannel(
+            "timing": _ArrayChannel(
                 "largest in the last 100 ms", "us", ("lateness", "computing_time")
             ),
         }
@@ -430,7 +432,7 @@ def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
         entries = [f"{vector.name}{number}" for number in numbers]
         unit = vector.unit or "-"
         array_name = f"{SENT_PREFIX}{vector.name}{suffix}"
-        arrays[array_name] = ArrayChannel(content, unit, entries)
+        arrays[array_name] = _ArrayChannel(content, unit, entries)
     return arrays
 
 

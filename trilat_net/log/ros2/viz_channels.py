@@ -21,7 +21,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 
-from ...errors import UsageError
 from ...net import topics
 from ...net.messages import Event, LinkStats
 from ...records import NS_PER_S
@@ -29,20 +28,16 @@ from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
 from ..log_writer import MakeViews, PutMessage, ReceiveMessage
 from ..mcap_writer import McapWriter
+from ..view_rates import FULL_RATE_HZ
 from . import ros2_messages
 from .cdr import JointStatePacker, pack_string
 from .ros2_messages import Record, Ros2Channel, SignalRow
 
-VIZ_HZ = 100.0
-"""Default rate of the messages with the joints and their error, in Hz."""
 SLOW_VIZ_HZ = 10.0
 """Rate of the messages with exogenous torque, estimate and mode, in Hz.
 
 If there is a message for every record with the joints, the same applies to these channels.
 """
-FULL_RATE_HZ = math.inf
-"""Rate that means a message for every record."""
-
 MAX_PENDING_BYTES = 1 << 13
 """Largest size of a site's messages that are not written yet, in bytes, for two joints."""
 SENT_PENDING_BYTES = 512
@@ -394,33 +389,6 @@ class _SiteBuckets:
         row_count = min(2, len(records))
         curves = ros2_messages.stack_signals(records)
         return _stamp_extremes(stamps_ns[:row_count], curves)
-
-
-def parse_viz_rate(text: str) -> float:
-    """Parses the option `--views`, the rate of the messages for viewers.
-
-    Args:
-        text: A number from 1 to 1e6, "off" or "full".
-
-    Returns:
-        The rate in Hz. It is 0 for "off" and `FULL_RATE_HZ` for "full".
-
-    Raises:
-        UsageError: The text is neither a number in range nor one of these words.
-    """
-    keywords = {"off": 0.0, "full": FULL_RATE_HZ}
-    if text in keywords:
-        return keywords[text]
-    try:
-        rate_hz = float(text)
-    except ValueError:
-        rate_hz = math.nan
-    if not 1.0 <= rate_hz <= 1e6:
-        raise UsageError(
-            "--views must be off, full, or a number of messages per second from 1 to 1000000, "
-            f"not {text!r}"
-        )
-    return rate_hz
 
 
 def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> list[StampedRow]:

@@ -15,26 +15,24 @@ Invariant:
       showing zeros.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis.link_summary import (
-    count_sent,
+    DelayDistribution,
     has_one_constant_delay,
-    predict_delivery,
-    read_arrivals,
-    sample_ages_ns,
+    measure_delay_distributions,
 )
-from ...analysis.site_signals import sample_ages_ms
 from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
 from ...core.step.vectors import Array
 from ...log.log_reader import Log
 from ...log.record_columns import Ints
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
+from ..plot_signals import sample_ages_ms
 from .figure_entry import draws, unless
 
 _POINTS = 400
@@ -50,23 +48,6 @@ NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tic
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
 """Number of bins of a histogram between 1 us and 10 us, and so on."""
-
-
-class DelayDistribution(NamedTuple):
-    """Delays and ages of the samples on one link.
-
-    Attributes:
-        peer: Name of the sender.
-        site: Name of the receiver.
-        delay_ms: Delays of the samples, shape (S,). They follow from the link's model if the
-            scenario has one, and were measured otherwise.
-        age_ms: Age of the sample in use at each tick of the receiver, shape (K,).
-    """
-
-    peer: str
-    site: str
-    delay_ms: Array
-    age_ms: Array
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
@@ -160,7 +141,7 @@ def has_varying_delay(log: Log) -> bool:
     unless(has_varying_delay, "every link is stated as one constant delay"),
     in_report=True,
 )
-def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the distributions of the delay and of the age of samples on every link.
 
     The delay of a sample is the time until its arrival, its age the time until its use. A curve
@@ -201,29 +182,6 @@ def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
     """Returns the models of every link: the first one, and one after every change."""
     changes = list_changes(log)
     return {link: list_stated_models(log, link, changes) for link in log.scenario.links}
-
-
-def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Collects the delays and ages of the samples on every link of a run.
-
-    Args:
-        log: Log of the run.
-
-    Returns:
-        An entry per link, ordered by receiver and then by sender.
-    """
-    distributions = []
-    for site in log.sites:
-        for peer, arrivals in read_arrivals(log, site).items():
-            newest = int(arrivals.sample.max(initial=-1))
-            sent_count = count_sent(log, peer, newest)
-            delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
-            # A link without a model has only measured delays, and only in a live session.
-            if not len(delay_ms) and log.driver == "live":
-                delay_ms = arrivals.delay_us / 1e3
-            age_ms = sample_ages_ns(log, peer, site) / 1e6
-            distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
-    return distributions
 
 
 def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
@@ -394,7 +352,7 @@ def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     explain_missing_loop_times,
     in_report=True,
 )
-def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws histograms of the timing of each site's control loop, in us.
 
     They show the lateness, by which a tick began after its planned time, and the time that its

@@ -21,7 +21,6 @@ from matplotlib.figure import Figure
 
 from ...analysis import site_signals
 from ...analysis.arm_rows import joint_positions_m, upright_axes
-from ...analysis.site_signals import reference_angles
 from ...analysis.timeline import recorded_end_s
 from ...core.step.vectors import Array
 from ...log.log_reader import Log
@@ -29,6 +28,7 @@ from ...scenario.arms import ArmModel
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..html_templates import render_macro
+from ..plot_signals import reference_angles
 from .figure_entry import draws
 
 INSTANTS = 6
@@ -70,7 +70,7 @@ _BASE: dict[str, Any] = {
 }
 
 
-class ArmPose(NamedTuple):
+class _ArmPose(NamedTuple):
     """The pose of a site's arm at some time, as points in the plane of a picture.
 
     Attributes:
@@ -88,7 +88,7 @@ class ArmPose(NamedTuple):
     shadow: Array
     bodies: Sequence[Array] = ()
 
-    def scale(self, factor: float) -> "ArmPose":
+    def scale(self, factor: float) -> "_ArmPose":
         """Returns the pose with all points multiplied by a factor.
 
         This converts a pose in m to the units of a picture.
@@ -96,7 +96,7 @@ class ArmPose(NamedTuple):
         Args:
             factor: The factor.
         """
-        return ArmPose(
+        return _ArmPose(
             actual=factor * self.actual,
             desired=factor * self.desired,
             path=factor * self.path,
@@ -206,7 +206,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     return sorted(times_s)
 
 
-def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
+def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
     """Returns the pose of a site in its last record until a time.
 
     Args:
@@ -239,12 +239,12 @@ def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
     if sizes_m:
         paths = trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])
         bodies = [path[0] for path in paths]
-    return ArmPose(
+    return _ArmPose(
         actual=actual[-1], desired=desired, path=actual[:, -1], shadow=shadow, bodies=bodies
     )
 
 
-def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
+def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
     """Returns a box around poses and the base, with a margin.
 
     Before the margin is added, the box is made at least 70 % as wide as it is high, and at
@@ -309,7 +309,7 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return figure
 
 
-def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
+def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
     """Draws a pose into a panel, or a note if `pose` is None because there is no record yet."""
     axes.set_aspect("equal")
     if pose is None:
@@ -370,7 +370,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
 
 
 def _measure_picture(
-    pose: ArmPose | None, index: int, bounds: PictureBox, label: str
+    pose: _ArmPose | None, index: int, bounds: PictureBox, label: str
 ) -> dict[str, Any]:
     """Returns the lines and points of a picture of a pose, as values for its template.
 

@@ -33,8 +33,8 @@ from ...core.arms.chain import LINK_PARAMETERS
 from ...core.step.vectors import Array
 from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
-from ...scenario.code_consent import find_user_laws
-from .. import style
+from ...own_code.code_consent import find_user_laws
+from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
@@ -54,7 +54,7 @@ _LINK_PANEL_PT = 5.5
 """Type size of titles and time labels in the figure of link parameters, in pt."""
 NO_OPERATOR = "no site has an operator in this run"
 
-explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
+explain_absent_operator = unless(plot_signals.sites_with_operator, NO_OPERATOR)
 """Returns the reason why a log has no torque of an operator. Empty if it has one."""
 
 
@@ -64,7 +64,7 @@ explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
     explain_absent_operator,
     in_report=True,
 )
-def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques of the operators on the arms over time, as Fig. 3 of the paper.
 
     An operator is the person or program that moves an arm. The torques are in N m.
@@ -76,7 +76,7 @@ def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return _draw_joints(
         log=log,
         form=form,
-        sites=site_signals.sites_with_operator(log),
+        sites=plot_signals.sites_with_operator(log),
         signal=style.site_records(log, site_signals.external_torques),
         label="torque on the arm (N m)",
     )
@@ -257,7 +257,7 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         if len(torques) == 2:
             torques[1].sharey(torques[0])
             torques[1].tick_params(labelleft=False)
-        operated_sites = site_signals.sites_with_operator(log)
+        operated_sites = plot_signals.sites_with_operator(log)
         torque_signal = style.site_records(log, site_signals.external_torques)
         angle_signal = style.site_records(log, site_signals.joint_angles)
         plot.joint_row(torques, operated_sites, torque_signal)
@@ -301,7 +301,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         )
         for site, row in zip(log.sites, grid, strict=True):
             actual = site_signals.joint_angles(log[site])
-            desired = site_signals.reference_angles(log[site])
+            desired = plot_signals.reference_angles(log[site])
             joints = actual.shape[1]
             for joint, axes in enumerate(row[:joints]):
                 plot.trace(axes, site, actual[:, joint], 1.6)
@@ -335,7 +335,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         form: Width, type sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
-    unit = site_signals.shared_unit(log)
+    unit = plot_signals.shared_unit(log)
     rows = len(style.arrange_joints(len(titles), form.narrow))
     with style.time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
         panels = style.add_joint_panels(plot.figure, len(titles), form, below="all")
@@ -378,7 +378,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    unit = site_signals.shared_unit(log)
+    unit = plot_signals.shared_unit(log)
     entries = []
     with style.time_figure(log, form, 2.4) as plot:
         axes = style.add_panels(plot.figure, 1, 1)[0, 0]
@@ -563,7 +563,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         form: Width, type sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
-    unit = site_signals.shared_unit(log)
+    unit = plot_signals.shared_unit(log)
     rate_unit = f"{unit.replace(',', '/s,')}/s"
     mosaic = style.arrange_joints(len(titles), form.narrow)
     columns = len(mosaic[0])
@@ -576,7 +576,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 continue
             line = style.site_line(log, site, _LOOP_PT)
             errors = site_signals.joint_errors(records)
-            rates = site_signals.joint_error_rates(records)
+            rates = plot_signals.joint_error_rates(records)
             joints = errors.shape[1]
             for joint, axes in enumerate(panels[:joints]):
                 path = np.stack([errors[:, joint], rates[:, joint]], axis=1)
@@ -730,7 +730,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-def list_sites_with_walls(log: Log) -> list[str]:
+def _list_sites_with_walls(log: Log) -> list[str]:
     """Lists the names of those sites whose arm can touch a wall.
 
     A site is a process that runs one arm. The sites have the order of the scenario, the
@@ -745,7 +745,7 @@ def list_sites_with_walls(log: Log) -> list[str]:
 @draws(
     "contact",
     "force of the walls, and depth in them",
-    unless(list_sites_with_walls, "no site has a wall in this run"),
+    unless(_list_sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the contact of the arms with walls over time.
@@ -757,7 +757,7 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    sites = list_sites_with_walls(log)
+    sites = _list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
         force_panel, depth_panel = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
         for site in sites:

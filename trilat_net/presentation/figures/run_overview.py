@@ -26,8 +26,8 @@ from ...analysis.timeline import recorded_end_s
 from ...core.step.vectors import Array
 from ...errors import UsageError
 from ...log.log_reader import Log
-from ...scenario.code_consent import may_run_user_laws
-from .. import style
+from ...own_code.code_consent import may_run_user_laws
+from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .figure_entry import draws
 
@@ -78,7 +78,7 @@ def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
 
     A record without any sample in use has the value NaN.
     """
-    ages_ms = site_signals.sample_ages_ms(log, site)
+    ages_ms = plot_signals.sample_ages_ms(log, site)
     # NumPy prints a warning for a row of NaN only. Therefore -inf stands for unknown ages.
     known_ms = np.where(np.isnan(ages_ms), -np.inf, ages_ms)
     oldest_ms: Array = known_ms.max(axis=1, initial=-np.inf)
@@ -86,7 +86,7 @@ def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
 
 
 _PANELS = (
-    _Panel("largest error", site_signals.shared_unit, _compute_largest_error, log_scale=True),
+    _Panel("largest error", plot_signals.shared_unit, _compute_largest_error, log_scale=True),
     _Panel("largest speed", lambda _: "rad/s", _compute_largest_speed),
     _Panel("largest torque", lambda _: "N m", _compute_largest_torque),
     _Panel("oldest sample", lambda _: "ms", _compute_oldest_sample_ms),
@@ -144,7 +144,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
     Raises:
         UsageError: There is no log, or the errors of the runs have different units.
     """
-    units = {site_signals.shared_unit(log) for log in logs.values()}
+    units = {plot_signals.shared_unit(log) for log in logs.values()}
     if not units:
         raise UsageError("there is no run to draw")
     if len(units) > 1:

@@ -37,7 +37,7 @@ Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
-class DelayMoments(NamedTuple):
+class _DelayMoments(NamedTuple):
     """Mean and standard deviation of the random delay of a link, both in ms."""
 
     mean_ms: float
@@ -144,7 +144,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         mean_ms, deviation_ms = self._moments()
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
-    def moments(self) -> DelayMoments:
+    def moments(self) -> _DelayMoments:
         """Mean and standard deviation of the random delay that a link is described with.
 
         A link is the one-way network connection between two sites, the processes of the arms.
@@ -152,7 +152,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         `playout_ms`, the enforced order of messages (`order`), and the upper limit of all
         delays, `MAX_DELAY_MS`.
         """
-        return DelayMoments(*self._moments())
+        return _DelayMoments(*self._moments())
 
     @property
     def random(self) -> bool:

@@ -19,8 +19,9 @@ from msgspec import Meta
 
 from ...core.links.delay import DelayKind, LinkModel, TraceEnd
 from ...core.step.vectors import Points
-from ...fields import KeyProblem, TomlTable, is_number
+from ...fields import KeyProblem, TomlTable
 from ..delay_traces import parse_trace
+from ..key_checks import is_number
 from . import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]

@@ -24,6 +24,14 @@ from ...core.arms.exogenous import TorqueKind, TorqueSource
 from ...core.step.vectors import Array
 from ...errors import ScenarioError
 from ..distributions import Draws
+from ..key_checks import (
+    VectorCounts,
+    check_choice,
+    check_keys,
+    expand_vectors,
+    field_names,
+    find_count_problem,
+)
 
 
 class HeldArm(NamedTuple):
@@ -40,7 +48,7 @@ class HeldArm(NamedTuple):
         draws: Object that replaces a random distribution in the settings by a drawn number.
     """
 
-    counts: fields.VectorCounts
+    counts: VectorCounts
     q0_rad: Any
     end_effector_m: Callable[[], list[float]]
     draws: Draws
@@ -260,8 +268,8 @@ def resolve_operators(
         if not isinstance(entry, dict):
             raise ScenarioError("must be a table", path=entry_path)
         kind = _find_kind(entry, kinds, entry_path)
-        fields.check_keys(entry, ("kind", *fields.field_names(kind)), entry_path)
-        expanded = fields.expand_vectors(entry, kind, held_arm.counts)
+        check_keys(entry, ("kind", *field_names(kind)), entry_path)
+        expanded = expand_vectors(entry, kind, held_arm.counts)
         table = held_arm.draws.draw_numbers(expanded, entry_path)
         kind.complete_table(table, entry, held_arm, entry_path)
         _check_values(
@@ -289,7 +297,7 @@ def _find_kind(
         is_of_group = isinstance(kind, str) and kind in group_kinds
         if is_of_group and kind not in kinds:
             raise ScenarioError(f"is {kind!r}, which belongs to {group}", path=f"{path}.kind")
-    fields.check_choice(kind, list(kinds), f"{path}.kind")
+    check_choice(kind, list(kinds), f"{path}.kind")
     return kinds[kind]
 
 
@@ -298,7 +306,7 @@ def _check_values(
     kind: type[ActorBase],
     entry: fields.TomlTable,
     path: str,
-    counts: fields.VectorCounts,
+    counts: VectorCounts,
 ) -> None:
     """Refuses a complete table if a value has a wrong type, range or length.
 
@@ -312,7 +320,7 @@ def _check_values(
         path: Path of the table, for error messages.
         counts: Lengths of the arm's vectors.
     """
-    is_planar = counts == fields.VectorCounts()
+    is_planar = counts == VectorCounts()
     placeholders = {
         name: planar_text if is_planar else chain_text
         for name, (planar_text, chain_text) in COUNT_TEXTS.items()
@@ -349,7 +357,7 @@ def _check_values(
 
 
 def _find_refusal(
-    table: fields.TomlTable, kind: type[ActorBase], counts: fields.VectorCounts
+    table: fields.TomlTable, kind: type[ActorBase], counts: VectorCounts
 ) -> tuple[str, str] | None:
     """Returns why a complete table is not valid, and the location of the wrong value.
 
@@ -361,7 +369,7 @@ def _find_refusal(
     except msgspec.ValidationError as error:
         problem, _, location = str(error).partition(" - at ")
         return problem, location
-    count_problem = fields.find_count_problem(table, kind, counts)
+    count_problem = find_count_problem(table, kind, counts)
     if count_problem is not None:
         return count_problem.problem, f"`$.{count_problem.key}`"
     for n, row in enumerate(table.get("points", ())):

@@ -28,6 +28,7 @@ from ...core.life.live_hand import HandReach, HandRules
 from ...core.step.site_setup import MotionLimits
 from ...errors import ScenarioError, count_nouns
 from ..arms import ArmModel
+from ..key_checks import check_choice, field_names
 from . import ActorBase, HeldArm, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
@@ -123,7 +124,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
             held_arm: Arm that the operator moves.
             path: Path of the settings in the scenario, for error messages.
         """
-        end_key, start_key = fields.field_names(cls)[:2]
+        end_key, start_key = field_names(cls)[:2]
         start_pose = held_arm.end_effector_m() if cls.at_tip else held_arm.q0_rad
         held_arm.draws.follow_start(table, start_key, start_pose, path)
         held_arm.draws.follow_start(table, end_key, table[start_key], path)
@@ -373,7 +374,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
     value_texts: ClassVar[Mapping[str, str]] = {
         **_AXES_TEXTS,
-        "device": "a table of " + ", ".join(fields.field_names(DeviceSettings)),
+        "device": "a table of " + ", ".join(field_names(DeviceSettings)),
     }
     is_open: ClassVar[bool] = True
     """True if any member of the session may take hold of the arm."""
@@ -412,7 +413,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                 an axis.
         """
         mode = entry.get("mode", "tip")
-        fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
+        check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
         mode_keys = LIVE_KEYS[mode]
         for key in list(table):
             if key in ("kind", "mode", *mode_keys):

@@ -25,8 +25,8 @@ from ...core.step.site_step import Site
 from ...core.step.ticks import NS_PER_S, tick_ns
 from ...core.step.vectors import Array
 from ...errors import describe_exception
-from ..class_arguments import make_own_instance
-from ..imported_code import (
+from ...own_code.class_arguments import make_own_instance
+from ...own_code.imported_code import (
     CLASS_PATTERN,
     CodeKey,
     Watch,
@@ -45,6 +45,9 @@ PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "set
 
 POLICY = "policy"
 """Name by which a trained program takes hold of an arm, as the log mentions it."""
+
+FAILED_HAND = "failed at tick"
+"""Words by which the events of a log say that a program failed while it moved an arm."""
 
 
 class ProgramHand(
@@ -310,7 +313,7 @@ class HandPlayer:
             k: Number of the tick in which it lets go.
             problem: Reason of the failure, as a string for the user.
         """
-        self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
+        self.failure = f"{self._site}: its hand {self._code} {FAILED_HAND} {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
         self.hand.release(k)
 

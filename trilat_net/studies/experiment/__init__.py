@@ -1,1 +1,1 @@
-"""Experiments with people: protocols, tasks, trials, measures and statistics."""
+"""Former places of names of `trilat_people.experiment`."""

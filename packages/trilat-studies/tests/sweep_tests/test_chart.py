@@ -13,10 +13,12 @@ from trilat_studies.sweep.stability_map import (
     PlaneAxis,
     StabilityCriterion,
     build_stability_map,
+    compute_borders,
     evaluate_criterion,
     find_criterion_edge,
     load_grid_scenario,
     make_panel_loader,
+    refine_columns,
     trace_closed_form,
     trace_linear_analysis,
 )
@@ -369,3 +371,39 @@ def test_a_condition_says_nothing_at_other_tick_rates(changes: dict[str, Any]) -
 def test_shares_in_a_circle_have_complex_roots_and_no_line() -> None:
     circle = {f"dominance.{a}": {b: 1.0} for a, b in (("m1", "m2"), ("m2", "s"), ("s", "m1"))}
     assert evaluate_criterion(load_scenario("p_d_margin", circle)) is None
+
+
+def test_line_between_few_columns_is_that_of_theory() -> None:
+    """Along each row the drawn line of P+d, d = K T / 2, crosses where theory does, for K = 10."""
+    over = ("link.delay_ms=0:800:400", "control.d=0.4:3.6:0.4")
+    plan = plan_sweep("p_d_margin", over=over)
+    first = next(rows())
+    cells = [
+        {**first, "link.delay_ms": delay, "control.d": damping}
+        for delay, damping in product(
+            (0.0, 400.0, 800.0), [round(0.4 * n, 1) for n in range(1, 10)]
+        )
+    ]
+    drawn = build_stability_map(SweepResults(plan, cells), (), linearly=False)
+    ((line,),) = drawn.lines
+    step_ms = np.diff(line.fine_positions).max()
+    assert step_ms <= 800.0 / 24 + 1e-9
+    assert line.excess.shape == (9, 3)
+    for row, damping in zip(line.drawn_excess, drawn.plane.y.values, strict=True):
+        (n,) = np.flatnonzero(np.diff(row > 0.0))
+        crossing_ms = np.interp(0.0, -row[n : n + 2], line.fine_positions[n : n + 2])
+        assert crossing_ms == pytest.approx(200.0 * damping, abs=0.5 * step_ms)
+
+
+def test_columns_of_a_fine_map_are_not_divided() -> None:
+    axis = PlaneAxis("link.delay_ms", tuple(np.arange(0.0, 500.0, 10.0).tolist()), "")
+    columns = refine_columns(axis, compute_borders(axis))
+    assert columns.values == axis.values
+    assert columns.on_grid == tuple(range(50))
+
+
+def test_fine_columns_contain_those_of_the_map() -> None:
+    axis = PlaneAxis("link.delay_ms", (1.0, 10.0, 100.0), "")
+    columns = refine_columns(axis, compute_borders(axis))
+    assert [columns.values[n] for n in columns.on_grid] == [1.0, 10.0, 100.0]
+    assert [columns.positions[n] for n in columns.on_grid] == [0.0, 1.0, 2.0]

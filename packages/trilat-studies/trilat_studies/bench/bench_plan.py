@@ -129,7 +129,7 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
     return dominance
 
 
-class BenchTask(NamedTuple):
+class _BenchTask(NamedTuple):
     """A task of the benchmark: what the operators do, and what the slave arm touches.
 
     Attributes:
@@ -162,20 +162,20 @@ _HANDOVER: dict[str, Any] = {
     ],
 }
 TASKS = {
-    "free": BenchTask(
+    "free": _BenchTask(
         "a user moves the slave by 0.3 m", {"sites.m1.hands": [_build_hand(_OUT)]}
     ),
-    "contact": BenchTask(
+    "contact": _BenchTask(
         "as free, but after half of the way the slave meets a wall of 2000 N/m",
         {"sites.m1.hands": [_build_hand(_OUT)], "sites.s.environment": [_WALL]},
     ),
-    "handover": BenchTask(
+    "handover": _BenchTask(
         "the first user lets go while dominance passes to the second",
         _HANDOVER,
         users=2,
         duration_s=24.0,
     ),
-    "disagree": BenchTask(
+    "disagree": _BenchTask(
         "two users hold poses 0.4 rad apart; the first user leads",
         {
             "sites.m1.hands": [_build_hand(_LEFT)],
@@ -184,12 +184,12 @@ TASKS = {
         },
         users=2,
     ),
-    "outage": BenchTask(
+    "outage": _BenchTask(
         "during free motion, all links of the slave fail for 3 s",
         {"sites.m1.hands": [_build_hand(_OUT)]},
         cut_s=_CUT_S,
     ),
-    "gravity-90": BenchTask(
+    "gravity-90": _BenchTask(
         "as free, but the laws get 90 % of the true gravity parameters",
         {"sites.m1.hands": [_build_hand(_OUT)]},
         gravity=0.9,
@@ -264,7 +264,7 @@ no gains come to rest in `contact`.
 """
 
 
-class BenchStudy(NamedTuple):
+class _BenchStudy(NamedTuple):
     """A named part of the benchmark: a selection of tasks, control laws and links.
 
     The study runs every law in every task over every link, except where a law does not fit a
@@ -294,21 +294,21 @@ _COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
 FULL_SEEDS = 1
 """Runs over a random link in the large studies: two cores then take about an hour."""
 STUDIES = {
-    "full": BenchStudy(
+    "full": _BenchStudy(
         about="all laws in all tasks",
         tasks=tuple(TASKS),
         laws=_ALL_LAWS,
         links=_COARSE,
         seeds=FULL_SEEDS,
     ),
-    "small": BenchStudy(
+    "small": _BenchStudy(
         about="all laws in all tasks, over three links",
         tasks=tuple(TASKS),
         laws=_ALL_LAWS,
         links=("rtt68", "rtt136-loss50", "4g"),
         seeds=2,
     ),
-    "round-trips": BenchStudy(
+    "round-trips": _BenchStudy(
         about="after Rodriguez-Seda, Lee and Spong (2009): wave variables, a Smith predictor, "
         "synchronisation, and P+d with its relatives, between two level arms, over a grid of "
         "round trips and losses",
@@ -929,7 +929,7 @@ def _gets_gravity(form: str, law: str) -> bool:
 
 
 def _list_cells(
-    study: BenchStudy,
+    study: _BenchStudy,
     tasks: Sequence[str],
     laws: Sequence[str],
     links: Sequence[str],

@@ -50,7 +50,7 @@ GridIndex = tuple[Any, ...]
 """Position of a run in the grid: its index on each axis, then its law and its seed."""
 
 
-class ConfirmedCell(NamedTuple):
+class _ConfirmedCell(NamedTuple):
     """A combination of parameters that was simulated, and then run over a real network.
 
     The combination is part of a sweep over parameters. The comparison shows whether the
@@ -152,7 +152,7 @@ def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
     return (*map(str, index[2:]), *index[:2])
 
 
-def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
+def confirm_cell(row: ResultRow, run: SessionRunner) -> _ConfirmedCell:
     """Runs a cell of a sweep over a real network, and compares the results.
 
     The cell is classified from the log of this live session, as the sweep classified it in
@@ -188,11 +188,11 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
             text = end.text
             live = classify_decision(end.stability, end.behaviour)
     log = path if path.exists() else None
-    return ConfirmedCell(row=row, virtual=virtual, live=live, text=text, log=log)
+    return _ConfirmedCell(row=row, virtual=virtual, live=live, text=text, log=log)
 
 
 def tabulate_confirmations(
-    confirmations: Sequence[ConfirmedCell], axes: Sequence[str]
+    confirmations: Sequence[_ConfirmedCell], axes: Sequence[str]
 ) -> TextTable:
     """Returns a table of the cells that were run live, with one row per cell.
 

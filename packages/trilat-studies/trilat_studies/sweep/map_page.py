@@ -53,6 +53,7 @@ from .stability_map import (
     PlaneAxis,
     StabilityEdge,
     StabilityMap,
+    compute_borders,
     find_map_edges,
 )
 from .sweep_cell import CellClass
@@ -319,15 +320,15 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
         norm = BoundaryNorm(class_borders, count)
         colours = {"cmap": palette, "norm": norm}
 
-    x = _compute_borders(plane.x)
-    y = _compute_borders(plane.y)
+    x = compute_borders(plane.x)
+    y = compute_borders(plane.y)
     axes.pcolormesh(x, y, values, rasterized=True, **colours)
 
 
 def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """Hatches the undecided cells. Neighbouring cells of a row form one rectangle."""
-    x = _compute_borders(plane.x)
-    y = _compute_borders(plane.y)
+    x = compute_borders(plane.x)
+    y = compute_borders(plane.y)
     undecided_rows = _find_undecided(plane, panel)
     for row, undecided in enumerate(undecided_rows):
         bottom = y[row]
@@ -373,9 +374,11 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
         plane: The measured part of the map.
         line: The line.
     """
-    x = _extend_positions(plane.x)
     y = _extend_positions(plane.y)
-    excess = _extrapolate_rows(line.excess, y)
+    excess = _extrapolate_rows(line.drawn_excess, y)
+    x = _extend_positions(plane.x)
+    if line.fine_positions:
+        x = np.concatenate([x[:1], line.fine_positions, x[-1:]])
     excess = _extrapolate_rows(excess.T, x).T
     # A border at zero may coincide with the first position. Only one of the two is kept.
     keep_x = np.diff(x, append=np.inf) > 0.0
@@ -404,7 +407,7 @@ def _find_line_style(line: MapLine) -> dict[str, Any]:
 
 def _extend_positions(axis: PlaneAxis) -> Array:
     """Returns the positions of the values of an axis, between the two borders of the panel."""
-    borders = _compute_borders(axis)
+    borders = compute_borders(axis)
     first_border = borders[:1]
     last_border = borders[-1:]
     return np.concatenate([first_border, axis.positions, last_border])
@@ -460,28 +463,6 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
     return has_runs & half_or_more
 
 
-def _compute_borders(axis: PlaneAxis) -> Array:
-    """Returns the borders of the cells along an axis, halfway between the values.
-
-    If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
-
-    Returns:
-        Positions, shape (n + 1,) for n values.
-    """
-    positions = axis.positions
-    first = positions[0]
-    if len(positions) == 1:
-        return np.array([first - 0.5, first + 0.5])
-    outer = positions[[0, -1]]
-    inner = positions[[1, -2]]
-    ends = 1.5 * outer - 0.5 * inner
-    middles = 0.5 * (positions[1:] + positions[:-1])
-    borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
-    if axis.is_evenly_spaced and first >= 0.0:
-        return np.maximum(borders, 0.0)
-    return borders
-
-
 def _set_scale(axes: Axes, plane: MapPlane) -> None:
     """Sets the limits and ticks of a panel.
 
@@ -489,8 +470,8 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
         axes: The panel in the figure.
         plane: The measured part of the map.
     """
-    x = _compute_borders(plane.x)
-    y = _compute_borders(plane.y)
+    x = compute_borders(plane.x)
+    y = compute_borders(plane.y)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     _set_ticks(axes.xaxis, plane.x)

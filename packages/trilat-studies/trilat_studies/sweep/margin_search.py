@@ -25,10 +25,10 @@ import numpy as np
 from trilat_net.analysis.theory.linear_edge import find_root_crossings
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.presentation.result_text import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
 
 from . import sweep_cell
@@ -209,7 +209,7 @@ class SearchRange(NamedTuple):
     tolerance: float
 
 
-class MarginItem(NamedTuple):
+class _MarginItem(NamedTuple):
     """Task for a worker process: find the limits of stability at one grid point of a sweep.
 
     The object can be pickled.
@@ -342,7 +342,7 @@ def search_margins(
         # If nothing is random, all seeds give the same result.
         is_random = plan.scenario(*cell_at_low_end.overrides).random
         seeds = plan.seeds if is_random else plan.seeds[:1]
-        searches += [MarginItem(plan, grid_point, seed, within) for seed in seeds]
+        searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
 
     # The workers need the files of control laws that users wrote.
     laws = list_imported_code([plan.base])
@@ -350,7 +350,7 @@ def search_margins(
         return pool.map(_search_margin_task, searches, progress)
 
 
-def _search_margin_task(task: MarginItem) -> GridPointMargin:
+def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
     The function needs nothing but its argument. Therefore any worker process can call it.

@@ -39,7 +39,6 @@ from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.analysis.theory.linear_edge import GrowthColumn, compute_growth_column
 from trilat_net.core.step.vectors import Array
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.fields import is_number
 from trilat_net.laws.adaptive import Adaptive
 from trilat_net.laws.conditions import COMMON_MOTION_SHARE, find_least_reversible
 from trilat_net.laws.p_d import PD
@@ -47,6 +46,7 @@ from trilat_net.scenario import Scenario, SiteSpec
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
+from trilat_net.scenario.key_checks import is_number
 from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
 
 from .fixed_gains import describe_fixed_gains
@@ -729,6 +729,82 @@ _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imag
 """Explanation of this line on the page of the map."""
 
 
+def compute_borders(axis: PlaneAxis) -> Array:
+    """Returns the borders of the cells along an axis, halfway between the values.
+
+    If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
+
+    Returns:
+        Positions, shape (n + 1,) for n values.
+    """
+    positions = axis.positions
+    first = positions[0]
+    if len(positions) == 1:
+        return np.array([first - 0.5, first + 0.5])
+    outer = positions[[0, -1]]
+    inner = positions[[1, -2]]
+    ends = 1.5 * outer - 0.5 * inner
+    middles = 0.5 * (positions[1:] + positions[:-1])
+    borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
+    if axis.is_evenly_spaced and first >= 0.0:
+        return np.maximum(borders, 0.0)
+    return borders
+
+
+_NO_COLUMNS: Array = np.zeros((0, 0))
+_FINE_COLUMNS = 24
+"""Least number of steps along x with which a line from theory is drawn."""
+
+
+class _FineColumns(NamedTuple):
+    """Columns at which a line from theory is computed, between and beside those of a map.
+
+    A map with few columns shows a line from theory only at these. Between them a straight
+    connection would be wrong, because the line is curved.
+
+    Attributes:
+        values: Values of x, in rising order.
+        positions: Positions along the axis at which they are drawn.
+        on_grid: Indices of the columns that are those of the map.
+    """
+
+    values: tuple[float, ...]
+    positions: tuple[float, ...]
+    on_grid: tuple[int, ...]
+
+
+def refine_columns(axis: PlaneAxis, borders: Array) -> _FineColumns:
+    """Divides the intervals between the columns of a map, unless these are many already.
+
+    Args:
+        axis: Horizontal axis of the map.
+        borders: Borders of the map's cells along the axis, shape (n + 1,) for n values. Lines
+            reach the outer ones if the values are equally spaced.
+    """
+    values = np.array(axis.values)
+    positions = axis.positions
+    intervals = len(values) - 1
+    parts = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
+    if intervals < 1 or parts == 1:
+        return _FineColumns(axis.values, tuple(positions.tolist()), tuple(range(len(values))))
+    indices = np.arange(intervals * parts + 1) / parts
+    fine_values = np.interp(indices, np.arange(len(values)), values)
+    fine_positions = np.interp(indices, np.arange(len(values)), positions)
+    fine_values[::parts] = values
+    on_grid = np.arange(len(values)) * parts
+    if axis.is_evenly_spaced:
+        half = max(1, parts // 2)  # the borders are half a cell away
+        before = np.linspace(borders[0], values[0], half, endpoint=False)
+        after = np.linspace(borders[-1], values[-1], half, endpoint=False)[::-1]
+        before = before[before < values[0]]
+        fine_values = np.concatenate([before, fine_values, after])
+        fine_positions = np.concatenate([before, fine_positions, after])
+        on_grid = on_grid + len(before)
+    return _FineColumns(
+        tuple(fine_values.tolist()), tuple(fine_positions.tolist()), tuple(on_grid.tolist())
+    )
+
+
 class MapLine(NamedTuple):
     """A line on a stability map that separates stable from unstable parameters.
 
@@ -742,6 +818,10 @@ class MapLine(NamedTuple):
         excess: The quantity at the grid points, shape (number of y values, number of x values).
             It is positive on the stable side, and NaN where it is not known.
         rank: Index of the line style. -1 is the style of measured lines.
+        fine_positions: Positions along x of the columns between which the line is drawn.
+            Empty if these are the columns of the map.
+        fine_excess: The quantity at these columns, shape (number of y values, number of
+            columns).
     """
 
     label: str
@@ -749,6 +829,27 @@ class MapLine(NamedTuple):
     about: str
     excess: Array
     rank: int
+    fine_positions: tuple[float, ...] = ()
+    fine_excess: Array = _NO_COLUMNS
+
+    @property
+    def drawn_excess(self) -> Array:
+        """The quantity at the columns between which the line is drawn."""
+        return self.fine_excess if self.fine_positions else self.excess
+
+    def thin_out(self, columns: _FineColumns) -> "MapLine":
+        """Returns this line, given at fine columns, with the columns of the map apart.
+
+        Args:
+            columns: The columns at which the line is given.
+        """
+        if len(columns.on_grid) == len(columns.values):
+            return self
+        return self._replace(
+            excess=self.excess[:, columns.on_grid],
+            fine_positions=columns.positions,
+            fine_excess=self.excess,
+        )
 
     @property
     def crosses_map(self) -> bool:
@@ -757,7 +858,7 @@ class MapLine(NamedTuple):
         This is so if somewhere four neighbouring grid points all have a value, and only some of
         them are on the stable side of the line.
         """
-        excess = self.excess
+        excess = self.drawn_excess
         lower = excess[:-1]
         upper = excess[1:]
         lower_left = lower[:, :-1]
@@ -1086,26 +1187,45 @@ def build_stability_map(
         return stability_map
 
     loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
+    fine = _choose_columns(loaders, x, y)
     panel_lines = []
     for panel, load in zip(plane.panels, loaders, strict=True):
         measured_line = _trace_zero_exponent(panel)
-        closed_form_line = trace_closed_form(load, x, y)
+        closed_form_line = trace_closed_form(load, x._replace(values=fine.values), y)
+        if closed_form_line is not None:
+            closed_form_line = closed_form_line.thin_out(fine)
         panel_lines.append([measured_line, closed_form_line])
     remarks = list[str]()
     if linearly:
-        tasks = [(load, x_value, y) for load in loaders for x_value in x.values]
+        tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
         with open_worker_pool(jobs, on, most=len(tasks)) as pool:
             columns = iter(pool.map(_analyse_column, tasks, progress))
         # The results come in the order of the tasks, panel by panel and column by column.
         for lines in panel_lines:
-            panel_columns = [next(columns) for _ in x.values]
+            panel_columns = [next(columns) for _ in fine.values]
             line, line_remarks = trace_linear_analysis(panel_columns, y)
-            lines.append(line)
+            lines.append(None if line is None else line.thin_out(fine))
             remarks += line_remarks
 
     crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
     distinct_remarks = tuple(dict.fromkeys(remarks))
     return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
+
+
+def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) -> _FineColumns:
+    """Returns the columns at which lines from theory are computed.
+
+    They are those of the map if the scenario is not valid between them, for example because
+    only whole numbers are.
+    """
+    fine = refine_columns(x, compute_borders(x))
+    try:
+        for load in loaders:
+            for value in fine.values:
+                load(value, y.values[0])
+    except ScenarioError:
+        return _FineColumns(x.values, tuple(x.positions.tolist()), tuple(range(len(x.values))))
+    return fine
 
 
 def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:

@@ -239,7 +239,7 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     return cell.judge()
 
 
-class JudgedCell(NamedTuple):
+class _JudgedCell(NamedTuple):
     """Result of a cell that was run side by side with others, if possible.
 
     Attributes:
@@ -251,7 +251,7 @@ class JudgedCell(NamedTuple):
     obstacle: str
 
 
-def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[JudgedCell]:
+def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCell]:
     """Runs cells side by side, if possible, and classifies the end of each run.
 
     The result of a cell is that of `classify_cell`, which explains the method.
@@ -274,7 +274,7 @@ def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[JudgedCel
             obstacles[index] = group.obstacle
         _run_group(group, cells)
     for cell, obstacle in zip(cells, obstacles, strict=True):
-        yield JudgedCell(cell.judge(), obstacle)
+        yield _JudgedCell(cell.judge(), obstacle)
 
 
 def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:

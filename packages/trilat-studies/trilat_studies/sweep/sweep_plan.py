@@ -27,10 +27,11 @@ import numpy as np
 
 from trilat_net.analysis.metrics.log_metrics import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
-from trilat_net.fields import is_number, split_unit
+from trilat_net.fields import split_unit
+from trilat_net.own_code.code_consent import allow_own_code
+from trilat_net.own_code.imported_code import name_law_classes
 from trilat_net.scenario import Scenario, apply_overrides
-from trilat_net.scenario.code_consent import allow_own_code
-from trilat_net.scenario.imported_code import name_law_classes
+from trilat_net.scenario.key_checks import is_number
 from trilat_net.scenario.laws import LAWS, identify_law
 from trilat_net.scenario.scenario_reader import ExperimentText, read_experiment
 from trilat_net.work.study_folder import format_command, format_toml_value, set_options
@@ -76,7 +77,7 @@ class _Steps:
         return f"{self._first + n * self._step:f}"
 
 
-class SweepAxis(NamedTuple):
+class _SweepAxis(NamedTuple):
     """One axis of a sweep: a scenario key and its values.
 
     Attributes:
@@ -118,7 +119,7 @@ class SweepAxis(NamedTuple):
         return f"{self.key}={self.texts[number]}"
 
 
-def parse_axis(description: str) -> SweepAxis:
+def parse_axis(description: str) -> _SweepAxis:
     """Parses the text with which a user describes an axis of a sweep.
 
     Args:
@@ -148,7 +149,7 @@ def parse_axis(description: str) -> SweepAxis:
     else:
         first, last, step = (_parse_decimal(key, part) for part in parts)
         texts = _build_range(key, first, last, step)
-    return SweepAxis(f"{key}={text}", key, texts)
+    return _SweepAxis(f"{key}={text}", key, texts)
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
@@ -352,7 +353,7 @@ class SweepPlan(NamedTuple):
     written: ExperimentText
     overrides: tuple[str, ...]
     base: Scenario
-    axes: tuple[SweepAxis, ...]
+    axes: tuple[_SweepAxis, ...]
     laws: dict[str, tuple[str, ...]]
     seeds: tuple[int, ...]
     longest_s: float
@@ -618,7 +619,7 @@ class _Base(NamedTuple):
 def _load_base(
     written: ExperimentText,
     overrides: Sequence[str],
-    axes: Sequence[SweepAxis],
+    axes: Sequence[_SweepAxis],
     laws: Sequence[str],
 ) -> _Base:
     """Loads the scenario of a sweep before its axes and laws are applied.

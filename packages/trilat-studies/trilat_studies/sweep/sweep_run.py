@@ -35,8 +35,8 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net.clock import SystemClock
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.laws import identify_law
 from trilat_net.work import executor
 from trilat_net.work.study_folder import (
@@ -407,7 +407,7 @@ site tick.
 """
 
 
-def uses_lanes(plan: SweepPlan, runs: int) -> bool:
+def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
     """Returns True if the runs of a sweep are to be computed side by side.
 
     Args:
@@ -613,7 +613,7 @@ def _run_cells(
             for number, seed in runs
             if (number, seed) not in journal.done
         )
-        runs_side_by_side = uses_lanes(plan, run_count - len(journal.done))
+        runs_side_by_side = _uses_lanes(plan, run_count - len(journal.done))
         if runs_side_by_side:
             _compile_lanes(plan)
         journal.run_pending(

@@ -25,7 +25,7 @@ import numpy as np
 
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.errors import ScenarioError, UsageError, suggest_nearest
-from trilat_net.fields import MAX_QUANTITY, is_number
+from trilat_net.fields import MAX_QUANTITY
 from trilat_net.laws.interface import (
     DAMPING,
     ERROR_DAMPING,
@@ -33,14 +33,15 @@ from trilat_net.laws.interface import (
     GainRange,
     TuningSite,
 )
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.imported_code import (
+from trilat_net.own_code.imported_code import (
     CodeConsent,
     CodeKey,
     allowed_code,
     import_class,
     read_code,
 )
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.key_checks import is_number
 from trilat_net.scenario.laws import BUILT_IN
 
 MIN_BOX = 0.1
@@ -151,7 +152,7 @@ SiteControls = dict[str, dict[str, Any]]
 """Complete table [control] of each site, by the name of the site."""
 
 
-class TunedGain(NamedTuple):
+class _TunedGain(NamedTuple):
     """A gain of a control law, with the range in which its best value is searched.
 
     Attributes:
@@ -181,7 +182,7 @@ class SearchSpace(NamedTuple):
     """
 
     law: str
-    knobs: tuple[TunedGain, ...]
+    knobs: tuple[_TunedGain, ...]
     known_facts: str
     kind: type[ControlLaw] | None = None
 
@@ -353,7 +354,7 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
             yield SearchSpace(_KNOWN, known_knobs, facts, kind)
 
 
-def _read_range(gain: str, entry: GainRange) -> TunedGain:
+def _read_range(gain: str, entry: GainRange) -> _TunedGain:
     """Returns the tuned gain that an entry of a built-in law's attribute `tune` describes.
 
     Args:
@@ -362,7 +363,7 @@ def _read_range(gain: str, entry: GainRange) -> TunedGain:
     """
     low, high, unit = entry[:3]
     role = entry[3] if len(entry) == 4 else ""
-    return TunedGain(gain, unit, low, high, where=role)
+    return _TunedGain(gain, unit, low, high, where=role)
 
 
 SEARCH_SPACES = {space.law: space for space in _list_search_spaces()}
@@ -434,7 +435,7 @@ def build_user_search_space(code: str) -> SearchSpace:
     return SearchSpace(code, knobs, facts)
 
 
-def _parse_user_range(code: str, name: Any, entry: Any) -> TunedGain:
+def _parse_user_range(code: str, name: Any, entry: Any) -> _TunedGain:
     """Returns the tuned gain that an entry of a user's attribute `tune` describes.
 
     Args:
@@ -452,4 +453,4 @@ def _parse_user_range(code: str, name: Any, entry: Any) -> TunedGain:
     if not in_order or not isinstance(unit, str):
         form = "(low, high) or (low, high, unit) with 0 < low < high, as in (10.0, 300.0)"
         raise UsageError(f"--law {code}: tune[{name!r}] must be {form}, not {entry!r}")
-    return TunedGain(str(name), unit, float(low), float(high))
+    return _TunedGain(str(name), unit, float(low), float(high))

@@ -35,9 +35,9 @@ from trilat_net.core.step.vectors import Array
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.execution.fused import FusedRun
 from trilat_net.net.clock import SystemClock
+from trilat_net.own_code.imported_code import name_law_classes
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.imported_code import name_law_classes
 from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
 from trilat_net.workers import count_cores
 
@@ -364,7 +364,7 @@ _PROBE_S = 2.0
 """Duration of the run from which the duration of a search is estimated, in s."""
 
 
-class PaperGainsResult(NamedTuple):
+class _PaperGainsResult(NamedTuple):
     """Score of the published gains of the adaptive law, in the scenario of a comparison.
 
     The gains are printed in the paper from which the law comes. The score shows what tuning
@@ -521,7 +521,7 @@ class TuningPlan(NamedTuple):
                 paper_scores += scores
         printed = []
         for name, score in zip(paper_names, paper_scores, strict=True):
-            printed.append(PaperGainsResult(name, paper_scenarios[0][name], score))
+            printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
         return TuningResult(self, searches, printed)
 
     def _build_items(
@@ -561,7 +561,7 @@ class TuningResult(Result):
 
     plan: TuningPlan
     found: list[CandidateSearch]
-    printed: list[PaperGainsResult]
+    printed: list[_PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
         """Yields the parts of the text that `trilat compare --tune` prints.
@@ -779,6 +779,10 @@ def plan_tuning(
         for other_seed in range(scenario.seed + 1, scenario.seed + seeds):
             texts = (*overrides, f"seed={other_seed}")
             others.append(load_tuning_scenario(source, texts))
+    for space in spaces:
+        # a law may refuse the scenario, for example its scheme: before the search, not in it
+        middle = CandidateSearch(space, 1, seed, Objective(objective)).propose_candidates(0)
+        base.with_gains(space, knowledge, middle[0])
     return TuningPlan(
         base=base,
         spaces=spaces,

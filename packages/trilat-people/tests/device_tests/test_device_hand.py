@@ -1,0 +1,337 @@
+"""A device at an arm, in whole sessions on one clock: what moves the target, what is felt, who lets go."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from trilat_people.devices.haply_inverse3 import SILENCE_S
+
+from tests.documentation import find_blocks
+from tests.sites.devices import ZERO, ScriptedDevice
+from tests.sites.relay import RelayClock
+from tests.sites.sessions import Session, reached
+from trilat_net.app.input_device import DeviceState
+from trilat_net.core.life.live_hand import SILENCE_NS
+from trilat_net.errors import UsageError
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import Log
+from trilat_net.net.bus import Bus
+from trilat_net.scenario import load_scenario
+
+Script = Callable[[float], DeviceState]
+HELD = {"a": True, "b": False}
+FREE = {"a": False, "b": False}
+SETTLED = 20
+"""Ticks from taking hold of an arm, which moves, until its target rests where the arm was seen."""
+
+
+class Led:
+    """A session of which a device leads m1: its log, the device, and what was said."""
+
+    def __init__(
+        self,
+        folder: Path,
+        script: Script,
+        device: dict[str, Any] | None = None,
+        mode: str = "tip",
+        hangs_s: tuple[float, float] = (1e9, 0.0),
+    ) -> None:
+        hands = [{"kind": "live", "mode": mode, **({"device": device} if device else {})}]
+        scenario = load_scenario(
+            "play",
+            {"duration_s": 3.0, "rate_hz": 200, "sites.m1.hands": hands, "link.delay_ms": 10},
+        )
+        session = Session.whole(scenario, folder)
+        self.said: list[str] = []
+
+        def act(bus: Bus, clock: RelayClock) -> None:
+            self.device = ScriptedDevice(clock, script, hangs_s)
+            reached(bus, clock).lead("m1", self.device, say=self.said.append)
+
+        session.stranger(act)
+        self.log: Log = session.run()
+
+    @property
+    def target(self) -> "np.ndarray[Any, np.dtype[np.float64]]":
+        """The target while somebody holds the arm, but for the first ticks, in which it finds its place."""
+        hand = self.log["m1"].hand
+        return hand[hand[:, 2] > 0.0, 3:5][SETTLED:]
+
+    @property
+    def changes(self) -> list[str]:
+        texts = [event.text for event in self.log.events if event.kind == "hand"]
+        return [text.partition(" at t")[0] for text in texts]
+
+
+def clutched(t_s: float) -> bool:
+    return t_s >= 0.2
+
+
+def moving(
+    place_m: Callable[[float], tuple[float, float, float]], pressed: Callable[[float], bool]
+) -> Script:
+    return lambda t_s: DeviceState(place_m(t_s), ZERO, HELD if pressed(t_s) else FREE)
+
+
+def up(t_s: float) -> tuple[float, float, float]:
+    """Moves up by 50 mm from 0.5 s to 1 s."""
+    return 0.3, -0.12, 0.15 + 0.1 * min(max(t_s - 0.5, 0.0), 0.5)
+
+
+def test_device_leads_the_arm_and_the_log_repeats_it(tmp_path: Path) -> None:
+    """Up of whoever holds the device is y of a planar arm; where the device began does not matter."""
+    led = Led(tmp_path, moving(up, clutched))
+    moved = led.target[-1] - led.target[0]
+    assert moved == pytest.approx([0.0, 0.05], abs=1e-9)
+    assert led.changes[0] == "m1: ScriptedDevice takes hold"
+    assert verify(led.log).passed
+
+
+@pytest.mark.parametrize(
+    ("frame", "scale", "moved"),
+    [
+        (["up", "left"], 1.0, [0.05, 0.0]),
+        (["ahead", "down"], 2.0, [0.0, -0.1]),
+        (["left", "ahead"], 1.0, [0.0, 0.0]),
+    ],
+)
+def test_frame_and_scale_turn_its_motion(
+    frame: list[str], scale: float, moved: list[float], tmp_path: Path
+) -> None:
+    led = Led(tmp_path, moving(up, clutched), {"frame": frame, "scale": scale})
+    assert led.target[-1] - led.target[0] == pytest.approx(moved, abs=1e-9)
+
+
+def test_open_clutch_moves_nothing_and_closing_it_makes_no_jump(tmp_path: Path) -> None:
+    """The device goes up by 50 mm with the clutch open; the arm stays held where it was."""
+    led = Led(tmp_path, moving(up, lambda t_s: 0.2 <= t_s < 0.4 or t_s > 1.5))
+    assert np.abs(led.target - led.target[0]).max() < 1e-12
+    assert led.changes == ["m1: ScriptedDevice takes hold"]  # held to the end
+    open_s = [t_s for t_s, force in led.device.rendered if force != ZERO and 0.41 < t_s < 1.5]
+    assert open_s == []
+
+
+def test_button_lets_go(tmp_path: Path) -> None:
+    def script(t_s: float) -> DeviceState:
+        return DeviceState(
+            up(t_s), ZERO, {"a": t_s < 2.0, "b": 1.0 < t_s < 1.1} if t_s > 0.2 else FREE
+        )
+
+    led = Led(tmp_path, script)
+    assert led.changes == ["m1: ScriptedDevice takes hold", "m1: ScriptedDevice lets go"]
+    held = led.log["m1"].t_s[led.log["m1"].hand[:, 2] > 0.0]
+    assert held[-1] - held[0] == pytest.approx(0.8, abs=0.02)
+
+
+def jumping(wrong: DeviceState) -> Script:
+    """Reports something else for three states while it moves up."""
+    return lambda t_s: (
+        wrong if 0.7 <= t_s < 0.715 else DeviceState(up(t_s), ZERO, HELD if t_s > 0.2 else FREE)
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "counted"),
+    [
+        (DeviceState((9.0, 9.0, 9.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
+        (DeviceState((1e300, -1e308, 0.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
+        (DeviceState((math.nan, 0.0, 0.0), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
+        (DeviceState((0.3, -0.12, math.inf), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
+        (
+            DeviceState((0.3, -0.12, 0.15), (math.nan, 0.0, 0.0), HELD),
+            "dropped 0 jumps, 3 unreadable",
+        ),
+    ],
+)
+def test_jumps_and_numbers_that_are_none_move_nothing(
+    wrong: DeviceState, counted: str, tmp_path: Path
+) -> None:
+    """The target misses what the device moved meanwhile at most, 2 mm, and stands still at the end."""
+    led = Led(tmp_path, jumping(wrong))
+    moved = led.target[-1] - led.target[0]
+    assert moved == pytest.approx([0.0, 0.05], abs=2.1e-3)
+    assert np.abs(np.diff(led.target, axis=0)).max() < 2.1e-3
+    assert counted in led.said[-1]
+
+
+def felt(led: Led) -> "np.ndarray[Any, np.dtype[np.float64]]":
+    """The largest force that the device rendered, and the last ones, N."""
+    return np.array([force for _, force in led.device.rendered])
+
+
+def test_device_renders_the_reaction_of_the_arm(tmp_path: Path) -> None:
+    """Where the hand pulls the arm up, the device pulls down, by the record's force, and not ahead."""
+    led = Led(tmp_path, moving(up, clutched), {"force_limit_n": 1000.0})
+    rendered = felt(led)
+    assert rendered[:, 2].min() < -1.0
+    assert np.abs(rendered[:, 1]).max() == 0.0
+    arm, part = led.log.scenario.arms["m1"], led.log["m1"]
+    pulls = [
+        300.0 * (row[4] - arm.end_effector(q)[1])
+        for row, q in zip(part.hand, part.q, strict=True)
+        if row[0] == 1.0
+    ]
+    assert rendered[:, 2].min() == pytest.approx(-max(pulls), rel=0.3)
+
+
+@pytest.mark.parametrize(("scale", "limit"), [(1.0, 2.0), (1.0, 0.5), (50.0, 1.5)])
+def test_force_stays_within_its_limit(scale: float, limit: float, tmp_path: Path) -> None:
+    led = Led(tmp_path, moving(up, clutched), {"force_scale": scale, "force_limit_n": limit})
+    assert np.linalg.norm(felt(led), axis=1).max() == pytest.approx(limit)
+
+
+def test_clutch_that_closes_lets_the_force_grow(tmp_path: Path) -> None:
+    """The arm is pulled by a target 50 mm off all the time: nothing is felt at once."""
+    led = Led(
+        tmp_path,
+        moving(up, lambda t_s: 0.2 <= t_s < 1.0 or t_s > 1.2),
+        {"force_limit_n": 1000.0},
+    )
+    after = [math.hypot(*force) for t_s, force in led.device.rendered if 1.2 < t_s < 1.4]
+    assert after[0] < 0.2 * max(after)
+    assert max(np.diff(after)) < 0.2 * max(after)
+
+
+@pytest.mark.parametrize("how", ["raises", "hangs"])
+def test_silent_device_lets_go_and_needs_its_button_anew(how: str, tmp_path: Path) -> None:
+    """It is away from 1 s to 1.5 s with its clutch pressed, which is let go at 2 s and pressed at 2.2 s."""
+
+    def script(t_s: float) -> DeviceState:
+        if 1.0 <= t_s < 1.5 and how == "raises":
+            raise TimeoutError("the device is silent")
+        return DeviceState(up(t_s), ZERO, FREE if t_s < 0.2 or 2.0 < t_s < 2.2 else HELD)
+
+    led = Led(tmp_path, script, hangs_s=(1.0, 0.5) if how == "hangs" else (1e9, 0.0))
+    gone = "lets go" if how == "raises" else "is silent: let go"
+    assert (
+        led.changes
+        == [f"m1: ScriptedDevice {what}" for what in ("takes hold", gone) * 2][:3]
+        + led.changes[3:]
+    )
+    part = led.log["m1"]
+    held = part.t_s[part.hand[:, 2] > 0.0]
+    (rest,) = np.flatnonzero(np.diff(held) > 0.1)
+    assert 0.9 < held[rest + 1] - held[rest] < 1.3
+    assert verify(led.log).passed
+    if how == "raises":
+        assert sum("the device is silent; the arm is let go" in line for line in led.said) == 1
+        assert led.device.entered == 2
+
+
+def test_lost_device_is_said_once_and_tried_again(tmp_path: Path) -> None:
+    def script(_: float) -> DeviceState:
+        raise ConnectionError("no service")
+
+    led = Led(tmp_path, script)
+    assert [line for line in led.said if "no service" in line] == [
+        "m1: no service; the arm is let go, and the device is tried again"
+    ]
+    assert led.device.entered > 2
+    assert led.changes == []
+
+
+def test_record_that_is_old_is_felt_no_more(tmp_path: Path) -> None:
+    """A site that stalls sends nothing: after 0.1 s the device is free."""
+    scenario = load_scenario("play", {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 10})
+    session, devices = Session.whole(scenario, tmp_path), list[ScriptedDevice]()
+
+    def act(bus: Bus, clock: RelayClock) -> None:
+        devices.append(ScriptedDevice(clock, moving(up, clutched)))
+        reached(bus, clock).lead("m1", devices[0], say=lambda _: None)
+
+    session.stranger(act)
+    session.clocks["m1"].stall(session.relay.now_ns + 2_300_000_000, 400_000_000)
+    session.run()
+    times = np.array([t_s for t_s, _ in devices[0].rendered])
+    forces = np.array([math.hypot(*force) for _, force in devices[0].rendered])
+    stale = np.flatnonzero((forces == 0.0) & (times > 0.6) & (times < 2.4))
+    assert 20 < stale.size < 80
+
+
+def test_device_of_the_page_leads_an_arm(tmp_path: Path) -> None:
+    """The class of docs/sessions/devices.md, which moves to the right at 5 cm/s and presses its clutch after 1 cm."""
+    names: dict[str, Any] = {}
+    (code,) = [
+        block.text
+        for block in find_blocks("docs/sessions/devices.md")
+        if block.language == "python"
+    ]
+    exec(code, names)
+    pushed, felt_n = names["Pushed"](), list[float]()
+    pushed.render = lambda force_n: felt_n.append(force_n[0])
+    session = Session.whole(
+        load_scenario("play", {"duration_s": 3.0, "rate_hz": 200}), tmp_path
+    )
+    session.stranger(
+        lambda bus, clock: reached(bus, clock).lead("m1", pushed, say=lambda _: None)
+    )
+    log = session.run()
+    target = log["m1"].hand[log["m1"].hand[:, 2] > 0.0, 3:5]
+    assert target[-1, 0] - target[SETTLED, 0] == pytest.approx(
+        0.05 * (len(target) - SETTLED) / 200, rel=0.1
+    )
+    assert min(felt_n) < -0.1
+
+
+def test_hand_that_is_not_led_by_its_tip_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="mode 'tip'"):
+        Led(tmp_path, moving(up, clutched), mode="joint")
+
+
+def test_a_service_is_given_up_before_a_hand_is_silent() -> None:
+    assert SILENCE_S * 1e9 < SILENCE_NS
+
+
+def pumped(t_s: float) -> DeviceState:
+    """Moves right by 0.3 m with the clutch pressed, back with it open, five times in 2 s; then left."""
+    phase = min(t_s, 2.2) % 0.4
+    back = max(t_s - 2.2, 0.0)
+    if t_s < 0.2:
+        return DeviceState(ZERO, ZERO, FREE)
+    if t_s < 2.2:
+        right = 0.3 * min(phase, 0.4 - phase) / 0.2
+        return DeviceState((right, 0.0, 0.0), ZERO, HELD if phase < 0.2 else FREE)
+    return DeviceState((-0.5 * back, 0.0, 0.0), ZERO, HELD)
+
+
+def test_repeated_clutching_keeps_the_target_within_reach(tmp_path: Path) -> None:
+    """Five strokes of 0.3 m, twice as large at the arm; the first motion back moves the target at once."""
+    led = Led(tmp_path, pumped, {"scale": 2.0})
+    reach_m = sum(led.log.scenario.arms["m1"].lengths_m)
+    hand = led.log["m1"].hand
+    held = hand[hand[:, 2] > 0.0]
+    radius_m = np.hypot(held[:, 3], held[:, 4])
+    assert radius_m.max() == pytest.approx(reach_m, abs=1e-6)
+    t_s = led.log["m1"].t_s[hand[:, 2] > 0.0]
+    begun = int(np.argmax(radius_m > reach_m - 1e-3))
+    back = held[-1, 3] - held[begun:, 3].max()
+    # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
+    assert back < -0.3
+    assert t_s[begun] < 2.2
+    assert verify(led.log).passed
+
+
+LATER = [pytest.param(gaps, marks=pytest.mark.long) for gaps in ((150, 10), (30, 90))]
+
+
+@pytest.mark.parametrize("gaps_ms", [(60, 10), *LATER], ids=str)
+def test_uneven_states_never_jerk_the_target(gaps_ms: tuple[int, int], tmp_path: Path) -> None:
+    """A hand at 0.3 m/s whose machine hands its places over in bursts: 37 N m within 1 ms before."""
+
+    def place(t_s: float) -> tuple[float, float, float]:
+        late, even = (1e-3 * gap for gap in gaps_ms)
+        seen_s = t_s - t_s % (late if int(t_s / 0.3) % 2 else even)
+        return 0.1 * math.sin(3.0 * seen_s), 0.0, 0.0
+
+    led = Led(tmp_path, moving(place, clutched))
+    m1 = led.log["m1"]
+    live = led.log.scenario.sites["m1"].find_live_hand()
+    held = m1.hand[m1.hand[:, 2] > 0.0]
+    rates = held[:, 5:7]
+    change = np.linalg.norm(np.diff(rates, axis=0), axis=1)
+    assert change.max() <= live.acceleration_limit_m_s2 / 200 + 1e-12
+    assert np.linalg.norm(rates, axis=1).max() <= live.speed_limit_m_s + 1e-12
+    assert np.ptp(held[SETTLED:, 3]) > 0.1

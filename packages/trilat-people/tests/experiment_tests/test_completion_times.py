@@ -1,0 +1,151 @@
+"""Completion times that a limit cuts off: medians by Kaplan and Meier, intervals, sign tests."""
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from trilat_people.experiment.completion_times import (
+    compare_times,
+    find_median,
+    find_median_interval,
+    find_unit_medians,
+    is_completed,
+    summarise_times,
+)
+from trilat_people.experiment.condition_figures import draw_learning, draw_times
+from trilat_people.experiment.statistics import Row
+
+LIMIT_S = 20.0
+Times = dict[str, dict[str, list[float]]]
+
+
+def rows_of(times_s: Times) -> list[Row]:
+    """Trials by condition and participant; those of the limit or longer were not completed."""
+    return [
+        {
+            "condition": condition,
+            "participant": who,
+            "trial": trial,
+            "completion_s": min(time_s, LIMIT_S),
+            "succeeded": int(time_s < LIMIT_S),
+        }
+        for condition, each in times_s.items()
+        for who, own in each.items()
+        for trial, time_s in enumerate(own, 1)
+    ]
+
+
+@given(st.lists(st.floats(0.1, 40.0), min_size=1, max_size=15, unique=True))
+def test_a_median_is_that_of_kaplan_and_meier(times_s: list[float]) -> None:
+    """SciPy's estimate of the survival function falls to one half at it."""
+    median = find_unit_medians(rows_of({"c": {"P1": times_s}}))["c"]["P1"]
+    completed = [time_s for time_s in times_s if time_s < LIMIT_S]
+    if 2 * len(completed) <= len(times_s):
+        assert math.isinf(median)
+        return
+    sample = stats.CensoredData(
+        uncensored=completed, right=[LIMIT_S] * (len(times_s) - len(completed))
+    )
+    survival = stats.ecdf(sample).sf
+    at_median = survival.quantiles[np.searchsorted(-survival.probabilities, -0.5 - 1e-12)]
+    if len(times_s) % 2:
+        assert median == pytest.approx(at_median)
+    else:  # half of the trials are over from there to the next time: the median lies in the middle
+        assert at_median <= median
+
+
+def test_the_limit_is_never_averaged() -> None:
+    """Whatever the limit was, medians and signs are the same."""
+    rows = rows_of({"near": {"P1": [5, 6, 7]}, "far": {"P1": [9.0, 30.0, 40.0]}})
+    other = [
+        {**row, "completion_s": row["completion_s"] if row["succeeded"] else 99.0}
+        for row in rows
+    ]
+    assert find_unit_medians(rows) == find_unit_medians(other)
+    (near, far) = summarise_times(rows, LIMIT_S)
+    assert (near.median, near.censored) == (6.0, 0)
+    assert (far.median, far.trials, far.censored, far.timed_out) == (None, 3, 2, 2)
+
+
+def test_failing_before_the_limit_is_counted_apart() -> None:
+    rows = [*rows_of({"c": {"P1": [3.0, 4.0, 5.0, 30.0]}})]
+    rows[1] = {**rows[1], "succeeded": 0}  # it left the corridor
+    (found,) = summarise_times(rows, LIMIT_S)
+    assert (found.trials, found.censored, found.timed_out) == (4, 2, 1)
+    assert found.median is None
+
+
+def test_rows_of_a_csv_file_say_the_same() -> None:
+    rows = rows_of({"a": {"P1": [3.0, 30.0, 5.0]}})
+    texts = [{key: str(value) for key, value in row.items()} for row in rows]
+    assert summarise_times(texts, LIMIT_S) == summarise_times(rows, LIMIT_S)
+    assert is_completed({"completion_s": 1.0})
+
+
+@given(st.lists(st.floats(0.1, 40.0), min_size=6, max_size=30))
+def test_an_interval_of_a_median_is_that_of_scipy(times_s: list[float]) -> None:
+    found = find_median_interval(times_s)
+    assert found is not None
+    expected = stats.quantile_test(times_s, q=1.0, p=0.5).confidence_interval(0.95)
+    assert found == pytest.approx((float(expected.low), float(expected.high)))
+
+
+def test_an_interval_may_be_open_above() -> None:
+    inf = math.inf
+    assert find_median_interval([1.0] * 5) is None  # five cannot enclose a median with 95 %
+    assert find_median_interval([1.0, 2.0, 3.0, 4.0, 5.0, inf]) == (1.0, None)
+    assert find_median_interval([inf] * 8) is None
+    assert find_median([2.0, inf]) == inf
+
+
+def test_signs_use_censored_times_and_no_more() -> None:
+    slow = {f"P{n}": [15.0 + n, 40.0, 40.0] for n in range(8)}
+    rows = rows_of(
+        {"fast": {f"P{n}": [8.0 + n, 9.0 + n, 30.0] for n in range(8)}, "slow": slow}
+    )
+    (found,) = compare_times(rows)
+    assert (found.number, found.longer, found.shorter) == (8, 8, 0)
+    assert found.p == pytest.approx(2.0 * 0.5**8)
+    assert found.difference is None  # the limit hides it
+
+
+def test_ties_and_the_difference_of_measured_medians() -> None:
+    """One of five was not reached under both conditions; the median of the others' differences stands."""
+    first = {f"P{n}": [float(5 + n)] for n in range(5)} | {"P4": [50.0]}
+    second = {f"P{n}": [float(7 + n)] for n in range(5)} | {"P4": [50.0]}
+    (found,) = compare_times(rows_of({"a": first, "b": second}))
+    assert (found.longer, found.shorter, found.number) == (4, 0, 5)
+    assert found.difference == 2.0
+    assert found.p == pytest.approx(2.0 * 0.5**4)
+
+
+def test_all_comparisons_are_corrected_together() -> None:
+    rows = rows_of(
+        {
+            name: {f"P{n}": [x + n] for n in range(8)}
+            for name, x in (("a", 1), ("b", 2), ("c", 3))
+        }
+    )
+    found = compare_times(rows)
+    assert [(one.first, one.second) for one in found] == [*combinations("abc", 2)]
+    assert [one.p_holm for one in found] == [3.0 * one.p for one in found if one.p is not None]
+
+
+def test_open_markers_stand_on_the_limit() -> None:
+    rows = rows_of({"near": {"P1": [5.0, 6.0]}, "far": {"P1": [9.0, 30.0]}})
+    for figure in (
+        draw_times(rows, LIMIT_S),
+        draw_learning(rows, "completion_s", limit_s=LIMIT_S),
+    ):
+        (axes,) = figure.axes
+        hollow = [
+            line
+            for line in axes.lines
+            if line.get_markerfacecolor() == "white" and len(line.get_xdata())
+        ]
+        assert hollow
+        assert {float(y) for line in hollow for y in np.asarray(line.get_ydata())} == {LIMIT_S}

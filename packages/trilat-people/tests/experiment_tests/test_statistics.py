@@ -1,0 +1,425 @@
+"""Statistics of experiments with people, against published numbers, and what is drawn with a known truth."""
+
+import io
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from trilat_people.experiment.condition_figures import draw_conditions
+from trilat_people.experiment.statistics import (
+    COMPUTED,
+    Row,
+    average_trials,
+    bootstrap_interval,
+    compare_conditions,
+    correct_holm,
+    find_least_number,
+    fit_mixed_model,
+    power,
+    simulate_power,
+    summarise_conditions,
+    write_methods,
+)
+
+from trilat_net.errors import UsageError
+from trilat_net.files import format_extra_install
+
+# Student (1908), extra hours of sleep under two drugs; the documentation of R's t.test has
+# t = -4.0621, df = 9, p-value = 0.002833, 95 percent confidence interval -2.4598858 -0.7001142.
+SLEEP = {
+    "first": [0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0],
+    "second": [1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4],
+}
+
+
+def tidy(values: Mapping[str, Any], trials: int = 1) -> list[Row]:
+    """Rows of values by condition, one for each participant; two participants make a pair."""
+    return [
+        {"participant": n, "pair": n // 2, "condition": name, "trial": trial, "time_s": value}
+        for name, column in values.items()
+        for n, value in enumerate(column)
+        for trial in range(trials)
+    ]
+
+
+def draw(
+    seed: int, number: int, effects: list[float], *, of_pair: float = 0.0, of_user: float = 1.0
+) -> list[Row]:
+    """Rows of participants in pairs, with one mean a condition, and deviations of pairs and users."""
+    rng = np.random.default_rng(seed)
+    base = np.repeat(rng.normal(0.0, of_pair, number // 2), 2) + rng.normal(
+        0.0, of_user, number
+    )
+    return tidy(
+        {
+            f"c{n}": base + effect + rng.normal(0.0, 1.0, number)
+            for n, effect in enumerate(effects)
+        }
+    )
+
+
+def test_paired_comparison_has_the_published_numbers() -> None:
+    (found,) = compare_conditions(tidy(SLEEP), "time_s")
+    assert (found.number, found.difference) == (10, pytest.approx(1.58))
+    assert found.t == pytest.approx(4.0621, abs=5e-5)
+    assert found.p == pytest.approx(0.002833, abs=5e-7) == found.p_holm
+    assert found.interval == pytest.approx((0.7001142, 2.4598858), abs=5e-8)
+    assert found.d_z == pytest.approx(4.0621 / np.sqrt(10.0), abs=2e-5)
+    spreads = [np.std(SLEEP[name], ddof=1) for name in SLEEP]
+    assert found.d_av == pytest.approx(1.58 / np.mean(spreads))
+
+
+def test_signed_ranks_have_the_published_probability() -> None:
+    """Of Darwin's plants, in Wilcoxon, "Individual comparisons by ranking methods" (1945)."""
+    higher = [6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75]
+    (found,) = compare_conditions(tidy({"self": [0] * 15, "cross": higher}), "time_s")
+    assert found.p_wilcoxon == pytest.approx(0.041259765625)
+
+
+def test_holm_corrects_as_r_does() -> None:
+    """R: p.adjust(c(0.01, 0.04, 0.03, 0.02), "holm") is 0.04 0.06 0.06 0.06."""
+    assert correct_holm([0.01, 0.04, None, 0.03, 0.02]) == pytest.approx(
+        [0.04, 0.06, None, 0.06, 0.06]
+    )
+    assert correct_holm([0.9, 0.8]) == [1.0, 1.0]
+    assert correct_holm([]) == []
+
+
+def test_more_trials_are_not_more_participants() -> None:
+    once, often = (compare_conditions(tidy(SLEEP, trials), "time_s") for trials in (1, 20))
+    assert once[0].number == often[0].number
+    assert once[0].p == pytest.approx(often[0].p)
+
+
+def test_what_a_pair_shares_is_counted_once() -> None:
+    rows = [{**row, "pair": row["participant"] // 2} for row in draw(1, 12, [0.0, 1.0])]
+    (users,), (pairs,) = (
+        compare_conditions(rows, "time_s", unit=u) for u in ("participant", "pair")
+    )
+    assert (users.number, pairs.number) == (12, 6)
+    assert users.difference == pytest.approx(pairs.difference)
+
+
+def test_participant_without_a_condition_is_left_out_of_it() -> None:
+    rows = draw(2, 8, [0.0, 1.0, 2.0])
+    kept = [row for row in rows if row["condition"] != "c2" or row["participant"] != 3]
+    empty = [{**row, "time_s": ""} if row not in kept else row for row in rows]
+    found = compare_conditions(kept, "time_s")
+    assert [(one.first, one.second, one.number) for one in found] == [
+        ("c0", "c1", 8), ("c0", "c2", 7), ("c1", "c2", 7)
+    ]  # fmt: skip
+    assert found == compare_conditions(empty, "time_s")
+    texts = [{key: str(value) for key, value in row.items()} for row in kept]
+    assert found == compare_conditions(texts, "time_s")
+
+
+def test_what_numbers_cannot_tell_is_none() -> None:
+    (alone,) = compare_conditions(tidy({"a": [1.0], "b": [3.0]}), "time_s")
+    assert (alone.difference, alone.p, alone.interval, alone.d_z) == (2.0, None, None, None)
+    (same,) = compare_conditions(tidy({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.5, 0.6]}), "time_s")
+    assert (same.t, same.p, same.p_holm, same.p_wilcoxon) == (None, None, None, None)
+    assert same.interval == pytest.approx((0.3, 0.3))
+    (none,) = compare_conditions(
+        [*tidy({"a": [1.0]}), {**tidy({"b": [2.0]})[0], "participant": 9}], "time_s"
+    )
+    assert (none.number, none.difference) == (0, None)
+
+
+def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
+    with pytest.raises(UsageError, match="a row lacks condition"):
+        average_trials([{"participant": 1, "time_s": 2.0}], "time_s")
+    with pytest.raises(
+        UsageError, match="no trial has a number for error_m; the rows contain time_s, trial"
+    ):
+        average_trials(tidy(SLEEP), "error_m")
+    with pytest.raises(
+        UsageError, match=r"time_s = 'fast' \(participant 0, condition a, trial 0\)"
+    ):
+        average_trials(tidy({"a": ["fast"]}), "time_s")
+    with pytest.raises(UsageError, match="give a finite number"):
+        average_trials(tidy({"a": [np.inf]}), "time_s")
+
+
+# --- intervals -------------------------------------------------------------------------------------------
+
+
+def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
+    first, second = summarise_conditions(tidy(SLEEP), "time_s")
+    assert (first.condition, first.number, first.mean) == ("first", 10, pytest.approx(0.75))
+    expected = stats.t.interval(0.95, 9, loc=0.75, scale=stats.sem(SLEEP["first"]))
+    assert first.interval == pytest.approx(expected)
+    assert second.bootstrap[0] < second.mean < second.bootstrap[1]
+    assert (second.mean - second.bootstrap[0]) == pytest.approx(
+        second.mean - second.interval[0], rel=0.25
+    )
+    (alone,) = summarise_conditions(tidy({"a": [2.0]}), "time_s")
+    assert alone == ("a", 1, 2.0, None, None, None, 0)
+
+
+def test_bootstrap_is_a_function_of_its_seed_and_follows_asymmetry() -> None:
+    times_s = np.exp(np.random.default_rng(5).normal(0.0, 1.0, 25)).tolist()
+    low, high = bootstrap_interval(times_s, 7)
+    assert (low, high) == bootstrap_interval(times_s, 7) != bootstrap_interval(times_s, 8)
+    assert high - np.mean(times_s) > 1.2 * (np.mean(times_s) - low)
+    assert bootstrap_interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
+    assert bootstrap_interval([2.0]) is None
+
+
+def test_bootstrap_holds_the_truth_about_as_often_as_it_says() -> None:
+    draws = np.random.default_rng(11).normal(3.0, 1.0, (120, 20))
+    intervals = [bootstrap_interval(row.tolist()) for row in draws]
+    assert np.mean([low <= 3.0 <= high for low, high in intervals]) > 0.87
+
+
+# --- mixed model -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def statsmodels() -> None:
+    pytest.importorskip("statsmodels", reason="the extra stats")
+
+
+@pytest.mark.usefixtures("statsmodels")
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("of_pair", [0.0, 1.0])
+def test_balanced_mixed_model_is_the_paired_t_test(seed: int, of_pair: float) -> None:
+    """Also where the variance of pairs is estimated as 0."""
+    rows = draw(seed, 16, [0.0, 0.8], of_pair=of_pair, of_user=1.5)
+    model = fit_mixed_model(rows, "time_s")
+    (paired,) = compare_conditions(rows, "time_s")
+    (found,) = model.effects
+    assert found.estimate == pytest.approx(paired.difference, rel=1e-9)
+    assert model.variances["participant"] > 0.0
+    assert (found.t, found.p) == pytest.approx((paired.t, paired.p), rel=2e-3)
+    assert found.interval == pytest.approx(paired.interval, rel=2e-3)
+
+
+@pytest.mark.usefixtures("statsmodels")
+def test_mixed_model_of_three_conditions_is_the_analysis_of_variance() -> None:
+    rows = draw(4, 16, [0.0, 0.5, 1.0], of_pair=1.5)
+    model = fit_mixed_model(rows, "time_s")
+    table = np.array([list(each.values()) for each in average_trials(rows, "time_s").values()])
+    rest = table - table.mean(axis=0) - table.mean(axis=1, keepdims=True) + table.mean()
+    assert model.freedom == 15 * 2
+    error = np.sqrt(2.0 * (rest**2).sum() / model.freedom / 16)
+    assert [one.error for one in model.effects] == pytest.approx([error, error], rel=1e-3)
+    assert model.variances["residual"] == pytest.approx(
+        (rest**2).sum() / model.freedom, rel=1e-3
+    )
+    assert model.reference == "c0"
+
+
+@pytest.mark.usefixtures("statsmodels")
+def test_mixed_model_finds_the_variances_that_were_drawn() -> None:
+    model = fit_mixed_model(draw(5, 240, [0.0, 0.2], of_pair=2.0, of_user=1.5), "time_s")
+    found = [model.variances[name] for name in ("pair", "participant", "residual")]
+    assert found == pytest.approx([4.0, 2.25, 1.0], rel=0.3)
+
+
+@pytest.mark.usefixtures("statsmodels")
+def test_mixed_model_takes_participants_who_lack_a_condition() -> None:
+    rows = [
+        row
+        for row in draw(6, 24, [0.0, 2.0], of_pair=1.0)
+        if row["participant"] or row["condition"] == "c0"
+    ]
+    model = fit_mixed_model(rows, "time_s")
+    assert model.freedom == 22
+    assert model.effects[0].interval[0] < 2.0 < model.effects[0].interval[1]
+
+
+@pytest.mark.usefixtures("statsmodels")
+def test_mixed_model_refuses_rows_without_one_pair_each() -> None:
+    with pytest.raises(UsageError, match="participant 0 is in pairs 0 and 7"):
+        fit_mixed_model([*tidy(SLEEP), {**tidy(SLEEP)[0], "pair": 7}], "time_s")
+    for pairs in ({"pair": ""}, {"pair": None}):
+        with pytest.raises(UsageError, match="no pair has two participants"):
+            fit_mixed_model([{**row, **pairs} for row in tidy(SLEEP)], "time_s")
+    with pytest.raises(UsageError, match="no pair has two participants"):
+        fit_mixed_model([{**row, "pair": row["participant"]} for row in tidy(SLEEP)], "time_s")
+    with pytest.raises(UsageError, match="no mixed model can be fitted"):
+        fit_mixed_model(tidy({"a": [1.0] * 6, "b": [1.0] * 6}), "time_s")
+    with pytest.raises(UsageError, match="2 means of 2 participants under"):
+        fit_mixed_model(tidy({"a": [1.0, 2.0]}), "time_s")
+
+
+def test_mixed_model_without_its_package_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "statsmodels.formula.api", None)
+    hint = f"mixed models need statsmodels: {format_extra_install('stats')}"
+    with pytest.raises(UsageError, match=re.escape(hint)):
+        fit_mixed_model(tidy(SLEEP), "time_s")
+
+
+# --- power -----------------------------------------------------------------------------------------------
+
+
+def test_power_has_the_published_values() -> None:
+    """The first is the example of G*Power's guide, the second of pwr.t.test in R."""
+    assert power(0.421637, 50) == pytest.approx(0.832114, abs=5e-7)
+    assert power(0.5, 34) == pytest.approx(0.8077775, abs=5e-8)
+    assert power(-0.5, 34) == power(0.5, 34)
+    assert power(0.0, 12) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("d_z", "number"), [(20.0, 2), (0.3, 100), (0.2, 1000), (0.5, 5000)])
+def test_power_is_the_chance_over_drawn_spreads(d_z: float, number: int) -> None:
+    """The integral of a normal over the chi distribution of the standard deviation."""
+    spread = stats.chi(number - 1).ppf((np.arange(20_000) + 0.5) / 20_000) / np.sqrt(number - 1)
+    critical, shift = stats.t.ppf(0.975, number - 1) * spread, d_z * np.sqrt(number)
+    chance = stats.norm.cdf(shift - critical) + stats.norm.cdf(-shift - critical)
+    assert power(d_z, number) == pytest.approx(chance.mean(), abs=1e-5)
+
+
+def test_least_number_is_the_first_with_enough_power() -> None:
+    for d_z, wanted in ((0.5, 0.8), (0.8, 0.9), (1.6, 0.95)):
+        number = find_least_number(d_z, wanted=wanted)
+        assert power(d_z, number) >= wanted > power(d_z, number - 1)
+    assert find_least_number(0.5) == 34
+    with pytest.raises(UsageError, match="cannot be reached with 100 units"):
+        find_least_number(0.1, most=100)
+
+
+@pytest.mark.parametrize(
+    ("number", "effect", "trials", "own"), [(34, 0.5, 1, 0.0), (12, 0.8, 4, 0.6)]
+)
+def test_simulated_power_agrees_with_the_formula(
+    number: int, effect: float, trials: int, own: float
+) -> None:
+    (found,) = simulate_power(
+        {"near": 0.0, "far": effect},
+        number,
+        trial_deviation=np.sqrt(0.5),
+        trials=trials,
+        effect_deviation=own,
+        repetitions=400,
+        seed=2,
+    )
+    assert found.d_z == pytest.approx(effect / np.sqrt(1.0 / trials + 2.0 * own**2))
+    assert found.interval[0] <= power(found.d_z, number) <= found.interval[1]
+    assert found.found_holm == found.found
+
+
+def test_correction_costs_power_and_keeps_its_order() -> None:
+    found = simulate_power(
+        {"a": 0.0, "b": 0.0, "c": 1.0}, 12, trial_deviation=0.8, repetitions=150, seed=3
+    )
+    assert [(one.first, one.second) for one in found] == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert all(one.found_holm <= one.found for one in found)
+    assert found[0].found_holm < 0.1 < 0.5 < found[1].found_holm
+
+
+def test_without_effect_p_is_uniform_and_families_keep_alpha() -> None:
+    runs = [
+        compare_conditions(draw(seed, 10, [0.0, 0.0, 0.0]), "time_s") for seed in range(300)
+    ]
+    for n in range(3):
+        assert stats.kstest([run[n].p for run in runs], "uniform").pvalue > 0.01
+    families = sum(min(one.p_holm for one in run) < 0.05 for run in runs)
+    assert families <= stats.binom.ppf(0.999, 300, 0.05)
+
+
+# --- methods paragraph and figure ------------------------------------------------------------------------
+
+FACTS: dict[str, Any] = {
+    "participants": 16,
+    "pairs": 8,
+    "excluded": 2,
+    "exclusions": ["left after block 1", "a site was cut off for 31.5 s"],
+    "design": "within participants, counterbalanced by a Williams square",
+    "blocks": 3,
+    "trials": 10,
+    "conditions": {
+        "near": {"delay_ms": 3.217, "delay_deviation_ms": 0.41},
+        "far": {"delay_ms": 301.93, "delay_deviation_ms": 2.75, "loss_percent": 0.125},
+    },
+    "law": "p_d",
+    "gains": {"K": 20.0, "d": [15.25, 14.5], "T_max_ms": 320},
+    "rate_hz": 1000,
+    "seeds": [71, 72],
+    "measures": ["completion_time_s", "path_m", "sparc"],
+    "correction": "Holm",
+    "alpha": 0.05,
+    "computed": COMPUTED,
+    "program": "0.1.0",
+    "digest": "9f2c",
+}
+
+
+def numbers(value: Any) -> Iterator[float]:
+    """Every number within a value."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list):
+        for one in value:
+            yield from numbers(one)
+    elif isinstance(value, int | float):
+        yield float(value)
+
+
+def test_methods_paragraph_has_every_number_it_was_given() -> None:
+    text = write_methods(FACTS)
+    said = {float(one) for one in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*\d)", text)}
+    assert set(numbers(FACTS)) <= said
+    assert "\n" not in text
+    assert text.endswith(".")
+    for words in (
+        "delay 301.93 ms", "loss 0.125 %", "T max 320 ms", "at 1000 Hz", "Williams", "corrected by Holm",
+        "completion time in s, path in m, sparc", "left after block 1",
+    ):  # fmt: skip
+        assert words in text
+
+
+def test_methods_paragraph_leaves_out_what_is_not_given() -> None:
+    text = write_methods(
+        {k: v for k, v in FACTS.items() if k not in ("pairs", "blocks", "exclusions", "alpha")}
+    )
+    assert "pairs" not in text
+    assert "2 more were excluded. The design" in text
+    assert "alpha" not in text
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"seeds": None}, "needs seeds"),
+        ({"seats": 3}, "unknown facts: seats; the known facts are participants"),
+        ({"conditions": {"near": {"loss_percent": 1}}}, "condition near has no delay"),
+    ],
+)
+def test_methods_paragraph_refuses_what_a_referee_would_ask(
+    changed: dict[str, Any], says: str
+) -> None:
+    facts = {key: value for key, value in {**FACTS, **changed}.items() if value is not None}
+    with pytest.raises(UsageError, match=says):
+        write_methods(facts)
+
+
+def test_every_participant_is_drawn_under_every_condition() -> None:
+    rows = [
+        row
+        for row in draw(9, 6, [0.0, 1.0, 2.0])
+        if row["participant"] != 4 or row["condition"] != "c1"
+    ]
+    figure = draw_conditions(rows, "time_s")
+    (axes,) = figure.axes
+    shown = {
+        (float(x), float(y))
+        for line in axes.lines
+        for x, y in zip(*line.get_data(), strict=True)
+    }
+    for n, (name, each) in enumerate(average_trials(rows, "time_s").items()):
+        assert axes.get_xticklabels()[n].get_text() == f"{name}\nn = {len(each)}"
+        assert {(float(n), mean) for mean in each.values()} <= shown
+    for n, one in enumerate(summarise_conditions(rows, "time_s")):
+        assert {(float(n), one.mean), *((float(n), end) for end in one.interval)} <= shown
+    assert axes.get_ylabel() == "time, s"
+    drawn = [io.BytesIO(), io.BytesIO()]
+    for file in drawn:
+        draw_conditions(rows, "time_s").savefig(file, format="png")
+    assert drawn[0].getvalue() == drawn[1].getvalue()

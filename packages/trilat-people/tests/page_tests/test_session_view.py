@@ -1,0 +1,103 @@
+"""When an onlooker calls a session silent, and when ended."""
+
+from trilat_people.live_page.session_view import SessionView, SiteView
+
+from recorder.site_reception import AWAY_NS
+from tests.net.local_bus import LocalNetwork
+from tests.net.manual_clock import ManualClock
+from trilat_net.analysis.certificate.running_energy import RecordWindow
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.membership import liveliness_token
+from trilat_net.net.messages import Event
+from trilat_net.net.wire import encode
+from trilat_net.scenario import load_scenario
+
+BOOT = 7
+
+
+class WatchedSession:
+    """A session of two sites that run, each of which was heard just now."""
+
+    def __init__(self) -> None:
+        self.clock, self._network = ManualClock(1), LocalNetwork()
+        scenario = load_scenario("two_sites")
+        self.view = SessionView(self._network.join(), self.clock, "t")
+        self.view.scenario = scenario
+        for name in scenario.names:
+            window = RecordWindow(scenario, name)
+            self.view.sites[name] = SiteView(self.view.bus, "t", scenario, name, BOOT, window)
+            self.hear(name, "setup", n=0)
+
+    def hear(self, name: str, kind: str, *, n: int) -> None:
+        """Lets an event of a site arrive now."""
+        event = Event(member=name, boot=BOOT, kind=kind, text=f"{name}: {kind}", n=n)
+        self._network.join().publisher(f"trilat/t/{name}/event")(encode(event))
+        self.view.poll()
+
+    def join(self) -> Bus:
+        """A connection of another member."""
+        return self._network.join()
+
+    def wait(self, seconds: float) -> None:
+        """Lets time pass, in which nothing arrives."""
+        self.clock.sleep_until(self.clock.monotonic_ns() + int(seconds * NS_PER_S))
+
+
+def test_silence_however_long_is_no_end() -> None:
+    session = WatchedSession()
+    session.wait(600.0)
+    assert not session.view.ended
+    assert session.view.session_silence_s == 600.0
+    session.hear("s", "hand", n=1)  # on a busy machine messages come again
+    assert session.view.session_silence_s == 0.0
+    assert session.view.silence_s(session.view.sites["m"]) == 600.0
+
+
+def test_the_last_end_message_ends_a_session() -> None:
+    session = WatchedSession()
+    session.hear("m", "end", n=1)
+    assert session.view.sites["m"].ended
+    assert not session.view.ended
+    session.hear("s", "end", n=1)
+    assert session.view.ended
+    session.wait(60.0)
+    assert [session.view.silence_s(site) for site in session.view.sites.values()] == [0.0, 0.0]
+
+
+def test_whoever_ran_the_sites_may_say_the_end() -> None:
+    """Sites that were killed send no end message."""
+    session = WatchedSession()
+    session.wait(60.0)
+    session.view.finish()
+    assert session.view.ended
+    assert session.view.session_silence_s == 60.0
+
+
+def test_a_session_whose_sites_have_all_left_has_ended() -> None:
+    """The network reports that they are gone, as after a kill; a token of a recorder is no site."""
+    session = WatchedSession()
+    site, recorder = session.join(), session.join()
+    site.announce(liveliness_token("t", "s", BOOT))
+    recorder.announce(liveliness_token("t", topics.RECORDER, BOOT))
+    session.wait(2.0 * AWAY_NS / NS_PER_S)
+    session.view.poll()
+    site.close()
+    session.view.poll()
+    assert not session.view.ended
+    session.wait(1.01 * AWAY_NS / NS_PER_S)
+    assert session.view.has_left
+    assert session.view.ended
+
+
+def test_sites_that_come_back_have_not_left() -> None:
+    session = WatchedSession()
+    for _ in range(2):
+        site = session.join()
+        site.announce(liveliness_token("t", "s", BOOT))
+        session.view.poll()
+        site.close()
+        session.wait(0.6 * AWAY_NS / NS_PER_S)
+        session.view.poll()
+    assert not session.view.ended

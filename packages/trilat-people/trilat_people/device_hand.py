@@ -1,0 +1,295 @@
+"""Moves an arm with a haptic input device, and renders the force of the arm on the device.
+
+The operator, the person who moves the arm, presses a button of the device, the clutch, and
+moves the device. The target of the arm then moves by the same distance, rotated and scaled by
+the settings of the scenario. While the clutch is not pressed, the operator can bring the device
+back to its middle position, and the target stays where it is. The reaction force of the arm is
+rendered on the device.
+
+Invariant:
+    - The target moves only by changes of the device's position while the clutch is pressed.
+      Positions that are not finite numbers, jumps, and the position of a device that was just
+      connected do not move the target, because they are not motions of the operator.
+    - The target never leaves the region that the arm can reach. A motion of the device that
+      would lead out of it is ignored, so that a motion back moves the arm at once.
+    - If the device sends nothing for some time, the arm is released. After any release, the
+      operator must press the clutch again, so that the arm never starts to move unexpectedly.
+    - The rendered force is zero while the clutch is not pressed, and if no recent record of the
+      arm is available.
+    - Targets are sent to the site only after a new state of the device. If the device or this
+      program stops working, the site receives no targets and releases the arm.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from trilat_net.app.input_device import Device, DeviceState, Vector
+from trilat_net.core.life.live_hand import GRIP_NS, SILENCE_NS, HandReach
+from trilat_net.errors import count_nouns
+from trilat_net.net.arm_client import Hand
+from trilat_net.net.clock import Clock
+from trilat_net.scenario.operators.kernel_operators import DeviceSettings
+
+RETRY_NS = 1_000_000_000
+"""Time between two attempts to connect to the device, in ns."""
+_MIN_STATE_GAP_S = 0.005
+"""Shortest time between two states that is assumed when a jump is detected, in s.
+
+The operating system may deliver states late, and several at once.
+"""
+_MAX_STATE_GAP_S = 0.05
+"""Longest time between two states that is assumed when a jump is detected, in s."""
+_TRIPS_KEPT = 60_000
+"""Number of round trips that are kept for statistics."""
+
+
+class DeviceHand:
+    """Moves one arm as its operator, with targets that follow the motion of an input device.
+
+    The process of a live operator creates the object and calls `run`.
+
+    Args:
+        hand: Connection to the site that runs the arm, in the role of its operator.
+        device: The input device, which a person moves.
+        settings: How the device moves the arm, and how force is rendered.
+        clock: Clock of this machine.
+        reach: Region that the arm can reach. The target never leaves it.
+
+    Attributes:
+        states: Number of states of the device (position, velocity, buttons) that were read.
+        jumps: Number of states that were ignored because the position had jumped.
+        unreadable: Number of states that were ignored because they contained NaN or infinity.
+        trips_ns: Times from a position of the device until the force that it caused was
+            rendered, in ns.
+    """
+
+    def __init__(
+        self,
+        hand: Hand,
+        device: Device,
+        settings: DeviceSettings,
+        clock: Clock,
+        reach: HandReach,
+    ) -> None:
+        self._hand = hand
+        self._device = device
+        self._settings = settings
+        self._clock = clock
+        self._reach = reach
+        # The axes of the arm in the coordinates of the device, a row per axis of the arm.
+        self._axes = settings.rows(len(hand.pose))
+
+        self.states = 0
+        self.jumps = 0
+        self.unreadable = 0
+        self.trips_ns = deque[int](maxlen=_TRIPS_KEPT)
+        # Number and sending time of the targets to which the arm has not responded yet.
+        self._sent = deque[tuple[int, int]](maxlen=_TRIPS_KEPT)
+
+        self._period_ns = 1_000_000_000 // device.rate_hz
+        self._due_ns = 0
+        self.release()
+
+    def release(self) -> None:
+        """Releases the arm, so that the motion of the device no longer moves it.
+
+        The arm stays released until the person presses the clutch, a button of the device.
+        """
+        self._hand.release()
+        # The target is empty while the arm is not held.
+        self._target: list[float] = []
+        self._position_m: Vector | None = None
+        # A clutch that is still pressed does not count as pressed again.
+        self._was_pressed = True
+        # Time at which the clutch was pressed. None while it is not pressed.
+        self._pressed_since_ns: int | None = None
+        self._received_ns = self._clock.monotonic_ns()
+        self._sent.clear()
+
+    def serve(self) -> None:
+        """Performs one period of the device: reads its motion and applies a force.
+
+        The method reads the position of the device, sends the site of the arm a new target, and
+        lets the device apply a force to the person. It takes one period of the device.
+
+        Raises:
+            OSError: The device is silent, or its connection is lost.
+        """
+        state = self._device.read()
+        now_ns = self._clock.monotonic_ns()
+        # If the device was silent, or this process was suspended, the site may have released
+        # the arm already.
+        if now_ns - self._received_ns > SILENCE_NS:
+            self.release()
+
+        self.states += 1
+        if all(map(math.isfinite, (*state.position_m, *state.velocity_m_s))):
+            self._follow(state, now_ns)
+        else:
+            self.unreadable += 1
+        if self._target:
+            number = self._hand.move(*self._target)
+            self._sent.append((number, now_ns))
+
+        # The force is read at the end of the period, when the site may have replied already.
+        self._due_ns = max(self._due_ns + self._period_ns, now_ns)
+        self._clock.sleep_until(self._due_ns)
+        self._device.render(self._compute_force())
+        self._measure_trips()
+
+    def _follow(self, state: DeviceState, now_ns: int) -> None:
+        """Applies the buttons of the device, and moves the target if the clutch is pressed.
+
+        The release button releases the arm. When the clutch is pressed for the first time, the
+        target starts at the present pose of the arm. Later it starts where it was left.
+
+        Args:
+            state: State of the device, with finite numbers.
+            now_ns: Present time on the local clock, in ns.
+        """
+        settings = self._settings
+        previous_position_m = self._position_m
+        elapsed_s = (now_ns - self._received_ns) * 1e-9
+        self._position_m = state.position_m
+        self._received_ns = now_ns
+        is_pressed = state.buttons.get(settings.clutch, False)
+        was_pressed = self._was_pressed
+        self._was_pressed = is_pressed
+
+        if state.buttons.get(settings.release, False):
+            self.release()
+            return
+        if not is_pressed:
+            self._pressed_since_ns = None
+            return
+        if not was_pressed:
+            self._pressed_since_ns = now_ns
+            if not self._target:
+                self._target = list(self._hand.pose)
+            return
+
+        # After a release of the arm, a clutch that is still pressed moves nothing.
+        is_clutch_active = self._pressed_since_ns is not None
+        if is_clutch_active and previous_position_m is not None:
+            positions = zip(state.position_m, previous_position_m, strict=True)
+            step_m = [new - previous for new, previous in positions]
+            self._move_target(step_m, elapsed_s)
+
+    def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
+        """Moves the target by a step of the device, unless the step is a jump.
+
+        A step is a jump if it is longer than the speed limit of the scenario allows.
+
+        Args:
+            step_m: Change of the device's position, in m.
+            elapsed_s: Time since the previous state, in s.
+        """
+        settings = self._settings
+        gap_s = min(max(elapsed_s, _MIN_STATE_GAP_S), _MAX_STATE_GAP_S)
+        if math.hypot(*step_m) > settings.jump_m_s * gap_s:
+            self.jumps += 1
+            return
+        target: list[float] = []
+        for coordinate, axis in zip(self._target, self._axes, strict=True):
+            target.append(coordinate + settings.scale * _compute_product(axis, step_m))
+        self._target = list(self._reach.find_nearest(target))
+
+    def _compute_force(self) -> Vector:
+        """Computes the force to render, the reaction force of the arm in device coordinates.
+
+        The force grows from zero within `GRIP_NS` after the clutch was pressed. It is zero if
+        the clutch is not pressed, the newest record is old, or this operator does not hold the
+        arm.
+
+        Returns:
+            The force, in N.
+        """
+        no_force = (0.0, 0.0, 0.0)
+        if self._pressed_since_ns is None:
+            return no_force
+        if not (self._hand.fresh and self._hand.holds):
+            return no_force
+
+        settings = self._settings
+        pressed_ns = self._clock.monotonic_ns() - self._pressed_since_ns
+        fade = min(1.0, pressed_ns / GRIP_NS)
+        force = [-settings.force_scale * fade * component for component in self._hand.force]
+        magnitude = max(math.hypot(*force), 1e-9)  # avoids a division by zero
+        reduction = min(1.0, settings.force_limit_n / magnitude)
+        device_axes = zip(*self._axes, strict=True)
+        x, y, z = (reduction * _compute_product(force, axis) for axis in device_axes)
+        return x, y, z
+
+    def _measure_trips(self) -> None:
+        """Measures the round trip time from a position of the device to the rendered force.
+
+        Each target was sent with a number. The newest record of the site states the number of
+        the target that the arm follows. The round trips of this target and of all earlier ones
+        end with the force that was just rendered.
+        """
+        used_number = self._hand.number
+        now_ns = self._clock.monotonic_ns()
+        while self._sent:
+            number, sent_ns = self._sent[0]
+            if number > used_number:
+                return
+            self._sent.popleft()
+            self.trips_ns.append(now_ns - sent_ns)
+
+    def describe(self) -> str:
+        """Returns a line for the user about the states of the device and the round trip times.
+
+        A state is a message of the device with its position. It is dropped if it cannot be
+        read, or if it is a jump: farther from the previous position than the speed limit of the
+        scenario allows. A round trip begins when a position of the device is sent to the arm.
+        It ends when the device renders the force with which the arm reacts to this position.
+
+        Returns:
+            The numbers of received states, of jumps and of unreadable states. If a round trip
+            was measured, also the median and the 99th percentile of the round trip time in ms.
+        """
+        states = count_nouns(self.states, "state")
+        jumps = count_nouns(self.jumps, "jump")
+        counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
+        if not self.trips_ns:
+            return counts
+        median_ms, p99_ms = np.percentile(self.trips_ns, [50, 99]) / 1e6
+        return (
+            f"{counts}; from its place to the force of it "
+            f"p50 {median_ms:.1f} ms, p99 {p99_ms:.1f} ms"
+        )
+
+    def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
+        """Moves the arm with the device until the session ends.
+
+        If the connection to the device is lost, the arm is released, and the device is tried
+        again until it is back.
+
+        Args:
+            stopped: Function that returns True to end the call.
+            say: Function that prints a line for the user.
+        """
+        is_present: bool | None = None  # None before the first attempt
+        while not (stopped() or self._hand.over):
+            try:
+                with self._device:
+                    while not (stopped() or self._hand.over):
+                        self.serve()
+                        if not is_present:
+                            button = repr(self._settings.clutch)
+                            say(f"the device is there: its button {button} takes hold")
+                        is_present = True
+            except OSError as problem:
+                self.release()
+                if is_present is not False:
+                    say(f"{problem}; the arm is let go, and the device is tried again")
+                is_present = False
+                self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
+
+
+def _compute_product(first: Sequence[float], second: Sequence[float]) -> float:
+    """Returns the scalar product of two vectors."""
+    return sum(a * b for a, b in zip(first, second, strict=True))

@@ -1,0 +1,36 @@
+"""Devices that a person holds to move an arm, one in each file.
+
+Each file has a class with the interface `Device`. `open_device` finds the class by the name of
+the file, so that a further device needs no entry in any list.
+"""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from trilat_net.app.input_device import Device
+from trilat_net.errors import UsageError
+
+
+def open_device(text: str) -> Device:
+    """Creates the object for the input device that the option --device names.
+
+    Args:
+        text: Value of the option: the name of the device, optionally followed by "=" and its
+            address, as in "spacemouse" or "haply_inverse3=ws://127.0.0.1:10001".
+
+    Raises:
+        UsageError: There is no such device.
+    """
+    name, _, address = text.partition("=")
+    known = sorted(module_info.name for module_info in iter_modules(__path__))
+    if name not in known:
+        raise UsageError(
+            f"--device must be one of {', '.join(known)}, "
+            f"optionally followed by =ADDRESS, not {text!r}"
+        )
+    module = import_module(f"{__name__}.{name}")
+    class_name = name.replace("_", "")
+    members = vars(module).items()
+    device_class = next(member for key, member in members if key.lower() == class_name)
+    device: Device = device_class(address) if address else device_class()
+    return device

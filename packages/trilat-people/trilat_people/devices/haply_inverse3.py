@@ -1,0 +1,168 @@
+"""Connects to the haptic device Inverse3 of Haply, through the service of its maker.
+
+The service is a program on the same machine. It exchanges JSON messages with this program over
+a WebSocket. This program sends a force, and the service replies with one state of the device. A
+new state therefore arrives only after the next force was sent, even if the force is zero.
+
+If a message of the service cannot be parsed, the state is returned with a position that is not
+finite. The class `DeviceHand`, which moves the arm, ignores such a state.
+"""
+
+import math
+from contextlib import ExitStack, suppress
+from typing import Any, ClassVar, Self
+from urllib.parse import urldefrag
+
+import msgspec
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import ClientConnection, connect
+
+from trilat_net.app.input_device import DeviceState, Vector
+from trilat_net.net.host_names import check_hosts
+
+SILENCE_S = 0.15
+"""Silence of the service after which the connection is closed, in s.
+
+It is shorter than the silence after which the site releases the arm.
+"""
+_NO_POSITION = (math.nan, math.nan, math.nan)
+"""Position of a state that could not be parsed."""
+_PARSE_ERRORS = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,
+    msgspec.MsgspecError,
+)
+"""Errors that a message with an unexpected content may cause."""
+_CONNECT_OPTIONS: dict[str, Any] = {
+    "compression": None,
+    "proxy": None,
+    "ping_interval": None,
+    "close_timeout": 0.2,
+}
+"""Options of the WebSocket for short delays."""
+
+
+class HaplyInverse3:
+    """An Inverse3 of Haply, a haptic device, as an input device that applies forces.
+
+    The device and its wireless grip are reached through version 3 of the maker's service, a
+    program that must run on this machine or another.
+
+    >>> tn.session("play").lead("m1", tn.HaplyInverse3())  # doctest: +SKIP
+
+    Args:
+        address: Address of the service. If it ends with "#values", forces are sent under the
+            key `values` instead of `vector`, as older versions of the service expect.
+    """
+
+    rate_hz: ClassVar[int] = 1000
+
+    def __init__(self, address: str = "ws://127.0.0.1:10001") -> None:
+        self._address, key = urldefrag(address)
+        self._force_key = key or "vector"
+        self._open = ExitStack()
+        self._socket: ClientConnection | None = None
+        self._configuration: dict[str, Any] = {}
+        self._id = ""
+        self._was_connected = False
+
+    def __enter__(self) -> Self:
+        # The address is checked before the first connection only: later the service may be
+        # away for a while.
+        if not self._was_connected:
+            check_hosts([self._address])
+
+        try:
+            connection = connect(self._address, open_timeout=2.0, **_CONNECT_OPTIONS)
+            self._socket = self._open.enter_context(connection)
+        except (OSError, ValueError, WebSocketException) as error:
+            raise ConnectionError(
+                f"no Inverse3 service answers at {self._address}: {error}"
+            ) from None
+
+        self._was_connected = True
+        # The first message also names this program to the service.
+        self._configuration = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}
+        self._id = ""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self.render((0.0, 0.0, 0.0))
+        self._open.close()
+
+    def read(self) -> DeviceState:
+        """Waits for the next state of the device from the service, and returns it.
+
+        Raises:
+            ConnectionError: The service has no device, or has closed the connection.
+            TimeoutError: The service is silent.
+        """
+        assert self._socket is not None, "the context has been entered"
+        try:
+            message = msgspec.json.decode(self._socket.recv(SILENCE_S))
+            return self._parse_state(message)
+        except TimeoutError:
+            raise TimeoutError(f"the service at {self._address} is silent") from None
+        except WebSocketException:
+            raise ConnectionError(
+                f"the service at {self._address} has closed the connection"
+            ) from None
+        except _PARSE_ERRORS:
+            return DeviceState(_NO_POSITION, _NO_POSITION, {})
+
+    def _parse_state(self, message: Any) -> DeviceState:
+        """Returns the state of the first Inverse3 in a message, with the buttons of all grips.
+
+        Args:
+            message: Decoded message of the service.
+
+        Raises:
+            ConnectionError: The service has no Inverse3.
+        """
+        if not message.get("inverse3"):
+            raise ConnectionError(f"the service at {self._address} has no Inverse3")
+
+        device = message["inverse3"][0]
+        self._id = str(device["device_id"])
+        state = device["state"]
+
+        buttons: dict[str, bool] = {}
+        for grip in message.get("wireless_verse_grip", []):
+            for name, is_pressed in grip["state"].get("buttons", {}).items():
+                buttons[name] = bool(is_pressed)
+        return DeviceState(
+            position_m=_parse_vector(state["cursor_position"]),
+            velocity_m_s=_parse_vector(state["cursor_velocity"]),
+            buttons=buttons,
+        )
+
+    def render(self, force_n: Vector) -> None:
+        """Sends a force to the device, which applies it to the person.
+
+        The message also requests the next state. Nothing is sent before the first state, which
+        contains the identity of the device.
+
+        Args:
+            force_n: Coordinates x, y and z of the force, in N.
+        """
+        if self._socket is None or not self._id:
+            return
+        force = {self._force_key: dict(zip("xyz", force_n, strict=True))}
+        command = {"device_id": self._id, "commands": {"set_cursor_force": force}}
+        message = self._configuration | {"inverse3": [command]}
+        try:
+            self._socket.send(msgspec.json.encode(message), text=True)
+        except WebSocketException:
+            raise ConnectionError(
+                f"the service at {self._address} has closed the connection"
+            ) from None
+        self._configuration = {}
+
+
+def _parse_vector(point: dict[str, float]) -> Vector:
+    """Returns a point of the service as a vector."""
+    return float(point["x"]), float(point["y"]), float(point["z"])

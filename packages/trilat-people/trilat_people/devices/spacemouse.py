@@ -1,0 +1,144 @@
+"""Reads a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
+
+A SpaceMouse is an input device whose cap is pushed and turned by hand. The cap can only be
+deflected from its rest position. The deflection is interpreted as a velocity, which is
+integrated to a position. If no report has arrived for `STILL_NS`, the cap is at rest, because a
+deflected cap reports continuously.
+"""
+
+import os
+import struct
+from pathlib import Path
+from typing import ClassVar, Self
+
+from trilat_net.app.input_device import DeviceState, Vector
+from trilat_net.net.clock import Clock, SystemClock
+
+STILL_NS = 100_000_000
+"""Time without a report after which the cap counts as not deflected, in ns."""
+SPEED_M_S = 0.2 / 350.0
+"""Velocity per count of an axis, in m/s. A fully deflected cap reports 350 counts."""
+_MAKER_IDS = (":0000256F:", ":0000046D:0000C62")
+"""USB identifiers of a SpaceMouse in a uevent file: 3Dconnexion, and earlier Logitech."""
+_MOTION_REPORT = 1
+"""Number of the reports that contain the deflection of the cap."""
+_BUTTON_REPORT = 3
+"""Number of the reports that contain the buttons."""
+
+
+def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
+    """Returns the file of the first SpaceMouse that is connected, such as "/dev/hidraw3".
+
+    Args:
+        devices: Folder in which Linux lists the hidraw devices.
+
+    Raises:
+        FileNotFoundError: No SpaceMouse is connected.
+    """
+    for uevent in sorted(devices.glob("*/device/uevent")):
+        identity = uevent.read_text(encoding="utf-8")
+        if any(maker in identity for maker in _MAKER_IDS):
+            return f"/dev/{uevent.parts[-3]}"
+    raise FileNotFoundError("no SpaceMouse is connected")
+
+
+class SpaceMouse:
+    """A SpaceMouse, a cap that is deflected by hand, as an input device without forces.
+
+    The deflection of the cap is integrated to a position. The first two buttons are "a" and
+    "b".
+
+    >>> tn.session("play").lead("m1", tn.SpaceMouse("/dev/hidraw3"))  # doctest: +SKIP
+
+    Args:
+        address: File of the device. Empty uses the first SpaceMouse that is connected.
+        clock: Clock of this machine. None creates one.
+    """
+
+    rate_hz: ClassVar[int] = 125
+
+    def __init__(self, address: str = "", clock: Clock | None = None) -> None:
+        self._address = address
+        self._clock = clock or SystemClock()
+        self._file = -1
+
+    def __enter__(self) -> Self:
+        self._file = os.open(self._address or find_spacemouse(), os.O_RDONLY | os.O_NONBLOCK)
+        self._position_m: Vector = (0.0, 0.0, 0.0)
+        self._velocity_m_s = self._position_m
+        self._button_bits = 0
+        now_ns = self._clock.monotonic_ns()
+        # Time of the last report, and time until which the velocity is integrated.
+        self._reported_ns = now_ns
+        self._read_ns = now_ns
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._file)
+
+    def read(self) -> DeviceState:
+        """Returns the present state of the device, whose cap a person pushes by hand.
+
+        The deflection of the cap is a velocity. The method integrates the velocity to a
+        position.
+
+        Returns:
+            The position relative to the position at the time of connection, the velocity, and
+            the state of the buttons.
+        """
+        now_ns = self._clock.monotonic_ns()
+        while self._read_report(now_ns):
+            pass
+
+        if now_ns - self._reported_ns > STILL_NS:
+            self._velocity_m_s = (0.0, 0.0, 0.0)
+
+        elapsed_s = (now_ns - self._read_ns) * 1e-9
+        self._read_ns = now_ns
+        x, y, z = self._position_m
+        vx, vy, vz = self._velocity_m_s
+        self._position_m = (
+            x + elapsed_s * vx,
+            y + elapsed_s * vy,
+            z + elapsed_s * vz,
+        )
+
+        buttons = {"a": bool(self._button_bits & 1), "b": bool(self._button_bits & 2)}
+        return DeviceState(self._position_m, self._velocity_m_s, buttons)
+
+    def _read_report(self, now_ns: int) -> bool:
+        """Reads the next report of the device, and stores the velocity or the buttons in it.
+
+        Args:
+            now_ns: Present time, in ns.
+
+        Returns:
+            True if a report was read. Another report may then follow. False if no report was
+            waiting.
+
+        Raises:
+            ConnectionError: The device was disconnected.
+        """
+        try:
+            report = os.read(self._file, 64)
+        except BlockingIOError:
+            return False
+        if not report:
+            raise ConnectionError("the SpaceMouse was disconnected")
+
+        kind = report[0]
+        if kind == _MOTION_REPORT and len(report) >= 7:
+            # The axes of the device point to the right, towards the person, and down.
+            right, near, down = struct.unpack_from("<3h", report, 1)
+            self._velocity_m_s = (SPEED_M_S * right, -SPEED_M_S * near, -SPEED_M_S * down)
+            self._reported_ns = now_ns
+        elif kind == _BUTTON_REPORT and len(report) >= 2:
+            self._button_bits = report[1]
+        return True
+
+    def render(self, force_n: Vector) -> None:
+        """Does nothing, because a SpaceMouse has no motors to apply a force.
+
+        Args:
+            force_n: Coordinates x, y and z of the force, in N. They are ignored.
+        """

@@ -1,0 +1,1 @@
+"""Experiments with people: protocols, tasks, trials, measures and statistics."""

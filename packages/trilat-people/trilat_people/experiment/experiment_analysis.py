@@ -1,0 +1,946 @@
+"""Analyses an experiment with people: means, comparisons, figures, and a methods paragraph.
+
+`analyse_experiment` reads the journals of an experiment's folder and writes tables, figures and
+a report into the folder. `compute_experiment_power` plans the number of participants.
+
+Invariant:
+    - The analysis follows from the journals alone.
+    - Practice and catch trials do not count.
+    - A trial that was not completed counts. Its completion time is censored: it is longer than
+      that of any completed trial (see `completion_times`).
+    - Every measure that trials have is summarised, also if all its values are equal. If numbers
+      of a measure are missing, their number is stated.
+    - Every number in a figure or a sentence is also in a table.
+    - The methods paragraph describes the analyses that were computed, and no others.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import UsageError, count_nouns
+from trilat_net.files import find_version, make_folder, make_subfolder, write_whole
+from trilat_net.presentation import style
+from trilat_net.presentation.result_text import Block, TextTable, compose, format_number
+from trilat_net.results import Result
+from trilat_net.work.study_folder import encode_csv
+
+from .completion_times import (
+    COMPLETION,
+    CompletionComparison,
+    CompletionTime,
+    compare_times,
+    find_unit_medians,
+    is_completed,
+    summarise_times,
+    to_table,
+)
+from .condition_figures import draw_conditions, draw_learning, draw_times
+from .experiment_run import Experiment, open_experiment
+from .movement_measures import measure_throughput
+from .statistics import (
+    CONFIDENCE,
+    Comparison,
+    ConditionMean,
+    MixedModel,
+    Row,
+    SimulatedPower,
+    average_trials,
+    compare_conditions,
+    find_least_number,
+    fit_mixed_model,
+    power,
+    simulate_power,
+    summarise_conditions,
+    write_methods,
+)
+
+MEASURES = (
+    "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc",
+    "force_mean_n", "force_mean_user1_n", "force_mean_user2_n", "wall_force_n",
+    "error_force_n", "error_handover_mm", "first_settled", "internal_rms_n", "useful_rms_n",
+    "internal_share", "first_effort_share", "first_work_j", "second_work_j", "first_taken_j",
+    "second_taken_j", "succeeded",
+)  # fmt: skip
+"""Measures that are compared between conditions if trials have them."""
+_UNCOUNTED_PHASES = ("before", "training", "retention")
+"""Phases of a training that are not compared between conditions."""
+FOLDER = "analysis"
+"""Folder of the analysis inside the folder of the experiment."""
+NOT_REACHED = "not reached"
+"""Text of a median if half of the trials or more were not completed."""
+
+
+class _MissingAnswers(NamedTuple):
+    """How many answers are missing in the questionnaires under one condition.
+
+    Attributes:
+        questionnaire: Name of the questionnaire.
+        condition: Condition of the block. Empty for a questionnaire after the experiment.
+        asked: Number of items, over all completed questionnaires.
+        missing: Number of these items without an answer.
+        forms: Number of completed questionnaires.
+        unscored: Number of questionnaires without a score because an answer is missing.
+    """
+
+    questionnaire: str
+    condition: str
+    asked: int
+    missing: int
+    forms: int
+    unscored: int
+
+
+class ExperimentAnalysis(Result):
+    """The statistics of an experiment: comparisons of its conditions, and texts for a paper.
+
+    Creating this object computes everything except the figures, which `write` draws. A unit is
+    a participant or a pair, whichever is sampled independently.
+
+    Args:
+        experiment: The experiment in its folder.
+        exclude: Participants or pairs whose data do not count, with the reasons.
+
+    Attributes:
+        unit: "participant" or "pair", which is sampled independently.
+        rows: Trials that count, as a table. With a training, only those after it.
+        learning_rows: Trials that count, in all phases of a training.
+        throughput_rows: Throughput (speed and accuracy in one number) of each unit and
+            condition.
+        gain_rows: Improvement by a training, of each unit and condition.
+        threshold_rows: Threshold of perception by a staircase, of each unit and condition.
+        means: For each measure, the mean under each condition. `completion_s` is included only
+            if all trials were completed.
+        comparisons: For each measure, the comparison of each pair of conditions.
+        times: Completion time under each condition, for a task with a time limit.
+        time_comparisons: Comparison of the completion times of each pair of conditions, if some
+            trials were not completed.
+        missing_answers: Missing answers of each questionnaire and condition.
+        absent: For each measure that this experiment could have but that no trial has a number
+            for, the reason.
+        models: Mixed models of the forces of users within pairs.
+        methods: Methods paragraph of a paper.
+        paths: Files that were written.
+
+    Raises:
+        UsageError: No trial that counts is done, or an excluded participant or pair does not
+            exist.
+    """
+
+    def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
+        self._experiment = experiment
+        self._exclude = exclude
+        protocol = experiment.plan.protocol
+        self.unit = experiment.unit
+        self._check_excluded()
+        counted = [row for row in experiment.to_rows() if self._is_counted(row)]
+        self.learning_rows = self._sort_by_condition(counted)
+        self.rows = [
+            row for row in self.learning_rows if row.get("phase") not in _UNCOUNTED_PHASES
+        ]
+        if not self.rows:
+            raise UsageError(
+                f"{experiment.folder}: there are no trials to analyse yet; practice trials, "
+                "catch trials and trials of excluded participants do not count"
+            )
+        self.throughput_rows = list(self._find_throughput())
+        self.gain_rows = list(self._find_gains())
+        self.threshold_rows = self._sort_by_condition(list(self._find_thresholds()))
+        scores = self._sort_by_condition(experiment.list_scores())
+        self._scores = [row for row in scores if row[self.unit] not in exclude]
+        self.times: list[CompletionTime] = []
+        self.time_comparisons: list[CompletionComparison] = []
+        if protocol.task.has_limit:
+            self._summarise_times()
+        forms = [form.name for form in protocol.questionnaires if form.after == "block"]
+        self.absent = self._find_absent(forms)
+        self.means: dict[str, list[ConditionMean]] = {}
+        self.comparisons: dict[str, list[Comparison]] = {}
+        for measure in (*MEASURES, *forms, *self._list_unit_measures()):
+            self._compare_measure(measure)
+        self.missing_answers = list(self._count_missing_answers())
+        self.models = list(self.fit_models())
+        self.methods = self._write_methods()
+        self.paths: list[Path] = []
+
+    def _check_excluded(self) -> None:
+        """Checks that the excluded participants or pairs exist.
+
+        Raises:
+            UsageError: One of them does not exist.
+        """
+        groups = self._experiment.plan.protocol.groups
+        names = {"-".join(group) for group in groups}
+        unknown = sorted(self._exclude.keys() - names)
+        if unknown:
+            valid = ", ".join(sorted(names))
+            raise UsageError(
+                f"there is no {self.unit} {', '.join(unknown)}; the {self.unit}s are {valid}"
+            )
+
+    def _is_counted(self, row: Mapping[str, Any]) -> bool:
+        """Returns True if a trial counts: not excluded, not for practice and no catch trial."""
+        if row[self.unit] in self._exclude:
+            return False
+        return not (row["practice"] or row["catch"])
+
+    def _sort_by_condition(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Returns rows in the protocol's order of conditions."""
+        conditions = list(self._experiment.plan.protocol.conditions)
+        return sorted(rows, key=lambda row: conditions.index(row["condition"]))
+
+    def _list_unit_measures(self) -> list[str]:
+        """Lists the measures that each unit has once per condition: gains, thresholds."""
+        keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
+        return [key for key in keys if key.startswith(("gain_", "threshold_"))]
+
+    def _compare_measure(self, measure: str) -> None:
+        """Summarises and compares a measure, if it has a number in any trial."""
+        # A mean of censored times is biased: `times` has their medians instead.
+        if measure == COMPLETION and self._has_censored_times():
+            return
+        rows = self.of(measure)
+        if any(row.get(measure) not in (None, "") for row in rows):
+            self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
+            self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
+
+    def _has_censored_times(self) -> bool:
+        """Returns True if some of the trials that count were not completed."""
+        return any(time.censored for time in self.times)
+
+    @property
+    def _limit_s(self) -> float:
+        """Time limit of a trial, in s."""
+        return self._experiment.plan.protocol.task.longest_s
+
+    @property
+    def _is_reaching(self) -> bool:
+        """True if the task is to reach targets."""
+        return self._experiment.plan.protocol.task.description.startswith("reaching")
+
+    def _summarise_times(self) -> None:
+        """Summarises the completion times, and compares them if some are missing."""
+        self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
+        if self._has_censored_times():
+            self.time_comparisons = compare_times(self.rows, unit=self.unit)
+
+    def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
+        """Returns the reason for each measure that this experiment could have and lacks.
+
+        Args:
+            forms: Names of the questionnaires.
+        """
+        absent = {}
+        for name in forms:
+            scores = [row.get(name) for row in self.of(name)]
+            if not scores:
+                absent[name] = "nobody has answered it"
+            elif all(score is None for score in scores):
+                absent[name] = "every questionnaire lacks an answer"
+        if self._is_reaching and not self.throughput_rows:
+            absent["throughput_bits_s"] = (
+                f"no {self.unit} has enough completed trials under a condition"
+            )
+        return absent
+
+    def _count_missing_answers(self) -> Iterator[_MissingAnswers]:
+        """Counts the missing answers of each questionnaire, separately for each condition.
+
+        A questionnaire has several items. A completed questionnaire, called form, belongs to
+        one participant and one block of trials. Two numbers are counted: the items without an
+        answer, and the forms that have no score because at least one answer is missing.
+
+        A block has one condition. A questionnaire that people answer only once, after the whole
+        experiment, belongs to no condition. Its condition is the empty text.
+
+        Yields:
+            The counts for each questionnaire and condition. Excluded participants do not count.
+        """
+        protocol = self._experiment.plan.protocol
+        when_answered = {form.name: form.after for form in protocol.questionnaires}
+        answer_groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for row in self._experiment.list_answers():  # one row for each item
+            name = row["questionnaire"]
+            if name in when_answered and row[self.unit] not in self._exclude:
+                is_per_block = when_answered[name] == "block"
+                condition = row["condition"] if is_per_block else ""
+                answer_groups.setdefault((name, condition), []).append(row)
+
+        for (name, condition), rows in answer_groups.items():
+            answers_of_form: dict[tuple[str, int], list[float | None]] = {}
+            for row in rows:
+                form_key = (row["participant"], row["block"])
+                answers_of_form.setdefault(form_key, []).append(row["value"])
+            incomplete_forms = sum(None in answers for answers in answers_of_form.values())
+            yield _MissingAnswers(
+                questionnaire=name,
+                condition=condition,
+                asked=len(rows),
+                missing=sum(row["value"] is None for row in rows),
+                forms=len(answers_of_form),
+                unscored=incomplete_forms,
+            )
+
+    def of(self, measure: str) -> Sequence[Row]:
+        """Returns the table rows in which a measure of the experiment can be found.
+
+        Depending on the measure, a row is a trial, a participant or pair, or a completed
+        questionnaire.
+
+        Args:
+            measure: Name of the measure, such as "completion_s".
+
+        Returns:
+            The rows, as mappings from column names to values. Empty if no questionnaire has the
+            measure.
+        """
+        rows_by_kind = {
+            "throughput": self.throughput_rows,
+            "gain": self.gain_rows,
+            "threshold": self.threshold_rows,
+        }
+        kind, separator, _ = measure.partition("_")
+        if separator and kind in rows_by_kind:
+            return rows_by_kind[kind]
+        if measure in MEASURES:
+            return self.rows
+        return [row for row in self._scores if measure in row]
+
+    def _find_throughput(self) -> Iterator[dict[str, Any]]:
+        """Yields the throughput of each unit and condition, if the task is reaching.
+
+        The throughput combines speed and accuracy. It needs at least two completed trials.
+        """
+        if not self._is_reaching:
+            return
+        groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for row in self.rows:
+            groups.setdefault((row[self.unit], row["condition"]), []).append(row)
+        for (unit, condition), rows in groups.items():
+            completed = [row for row in rows if row["succeeded"]]
+            if len(completed) < 2:
+                continue
+            throughput = measure_throughput(
+                starts=_list_points(completed, "start"),
+                targets=_list_points(completed, "target"),
+                ends=_list_points(completed, "end"),
+                times_s=[row["completion_s"] for row in completed],
+            )
+            if throughput is not None:
+                yield {
+                    self.unit: unit,
+                    "condition": condition,
+                    "throughput_bits_s": throughput.bits_s,
+                }
+
+    def _find_gains(self) -> Iterator[dict[str, Any]]:
+        """Yields the gain of each unit and condition by a training.
+
+        A gain is the mean before the training minus the mean right after it (transfer), or
+        minus the mean in the later test (retention).
+        """
+        measure = self._experiment.plan.protocol.task.learning_measure
+        means: dict[str, dict[str, dict[str, float]]] = {}
+        for phase in ("before", "after", "retention"):
+            rows = [row for row in self.learning_rows if row.get("phase") == phase]
+            if rows:
+                means[phase] = self._average_learning(rows, measure)
+        means_before = means.pop("before", {})
+        for condition, means_by_unit in means_before.items():
+            for unit, mean_before in means_by_unit.items():
+                gains: dict[str, float] = {}
+                for phase, phase_means in means.items():
+                    later_mean = phase_means.get(condition, {}).get(unit)
+                    if later_mean:
+                        gains[f"gain_{phase}_{measure}"] = mean_before - later_mean
+                yield {self.unit: unit, "condition": condition, **gains}
+
+    def _is_censored(self, measure: str) -> bool:
+        """Returns True if a measure is the completion time and some of them are missing."""
+        has_limit = self._experiment.plan.protocol.task.has_limit
+        if measure != COMPLETION or not has_limit:
+            return False
+        return not all(map(is_completed, self.learning_rows))
+
+    def _average_learning(
+        self, rows: Sequence[Row], measure: str
+    ) -> dict[str, dict[str, float]]:
+        """Returns the mean of a learning measure for each condition and unit.
+
+        If some trials were not completed, medians take the place of means. A median that was
+        not reached is left out.
+        """
+        if not self._is_censored(measure):
+            return average_trials(rows, measure, self.unit)
+        reached: dict[str, dict[str, float]] = {}
+        for condition, medians in find_unit_medians(rows, self.unit).items():
+            reached[condition] = {
+                unit: median for unit, median in medians.items() if math.isfinite(median)
+            }
+        return reached
+
+    def _find_thresholds(self) -> Iterator[dict[str, Any]]:
+        """Yields the threshold of each unit and condition, if the protocol has a staircase.
+
+        Staircases without enough reversals have no threshold.
+        """
+        plan = self._experiment.plan
+        choices = self._experiment.list_choices()
+        staircase = plan.protocol.staircase
+        if staircase is None:
+            return
+        # Each block has a staircase, which its first trial stands for.
+        first_trials = [trial for trial in plan.trials if trial.trial == 1]
+        for planned in first_trials:
+            are_right = plan.judge_choices(planned, choices)
+            threshold = staircase.find_threshold(are_right)
+            unit = "-".join(planned.group)
+            if threshold is not None and unit not in self._exclude:
+                yield {
+                    self.unit: unit,
+                    "condition": planned.condition,
+                    staircase.measure: threshold,
+                }
+
+    def _write_methods(self) -> str:
+        """Returns the methods paragraph of a paper, with the numbers of this experiment."""
+        plan = self._experiment.plan
+        protocol = plan.protocol
+        scenario = next(iter(plan.scenarios.values()))
+        number = len({row[self.unit] for row in self.rows})
+        participants = number * len(protocol.users)
+        delays = {}
+        for name in protocol.conditions:
+            delays_ms = [row["delay_ms"] for row in self.rows if row["condition"] == name]
+            if delays_ms:
+                delays[name] = {"delay_ms": round(float(np.mean(delays_ms)), 1)}
+        site = scenario.sites[protocol.users[0]]
+        control = msgspec.to_builtins(site.control)
+        exclusions: list[str] = []
+        for name, reason in self._exclude.items():
+            exclusions.append(f"{name}: {reason}" if reason else name)
+        # The paragraph does not mention facts that are "".
+        facts: dict[str, Any] = {
+            "participants": participants,
+            "pairs": number if self.unit == "pair" else "",
+            "excluded": len(protocol.groups) * len(protocol.users) - participants,
+            "exclusions": ", ".join(exclusions),
+            "training": protocol.training.describe() if protocol.training else "",
+            "staircase": protocol.staircase.describe() if protocol.staircase else "",
+            "design": protocol.design,
+            "blocks": len(protocol.conditions),
+            "trials": protocol.trials,
+            "conditions": delays,
+            "law": control.pop("law"),
+            "rate_hz": site.rate_hz,
+            "gains": control,
+            "seeds": [protocol.seed],
+            "program": f"trilat-net {find_version()}",
+            "digest": plan.digest,
+            "measures": list(self.means),
+            "unit": self.unit,
+            "correction": "Holm",
+            "computed": self._list_computed(),
+            "completion": self._describe_times(),
+            "answers": self._describe_missing_answers(),
+        }
+        return write_methods(facts)
+
+    def _list_computed(self) -> list[str]:
+        """Lists which analyses were computed, of those that a methods paragraph describes."""
+        tests = list(chain.from_iterable(self.comparisons.values()))
+        means = list(chain.from_iterable(self.means.values()))
+        is_computed = {
+            "intervals": any(mean.interval is not None for mean in means),
+            "bootstrap": any(mean.bootstrap is not None for mean in means),
+            "t tests": any(test.p is not None for test in tests),
+            "wilcoxon": any(test.p_wilcoxon is not None for test in tests),
+            "effect sizes": any(test.d_z is not None for test in tests),
+            "sign tests": any(test.p is not None for test in self.time_comparisons),
+            "mixed models": bool(self.models),
+        }
+        return [analysis for analysis, computed in is_computed.items() if computed]
+
+    def _describe_times(self) -> str:
+        """Returns the sentence about trials that were not completed. Empty if all were."""
+        trials = sum(time.trials for time in self.times)
+        censored = sum(time.censored for time in self.times)
+        if not censored:
+            return ""
+        timed_out = sum(time.timed_out for time in self.times)
+        sooner = censored - timed_out
+        failed = f" and {sooner} failed sooner" if sooner else ""
+        return (
+            f"{timed_out} of {count_nouns(trials, 'trial')} ran into the time limit of "
+            f"{self._limit_s:g} s{failed}; their completion times are right-censored, "
+            "and completion is summarised by the median of Kaplan and Meier "
+            f"per {self.unit} and condition"
+        )
+
+    def _describe_missing_answers(self) -> str:
+        """Returns the sentence about missing answers. Empty if no answer is missing."""
+        missing = sum(answers.missing for answers in self.missing_answers)
+        question_count = sum(answers.asked for answers in self.missing_answers)
+        unscored = sum(answers.unscored for answers in self.missing_answers)
+        if not missing:
+            return ""
+        plural = "questionnaire has" if unscored == 1 else "questionnaires have"
+        return (
+            f"{missing} of {count_nouns(question_count, 'answer is', 'answers are')} missing; "
+            f"{unscored} {plural} no score for that reason"
+        )
+
+    def write(self, folder: Path) -> "ExperimentAnalysis":
+        """Writes tables, figures, the methods paragraph and a report into a folder.
+
+        Afterwards, `paths` lists the written files.
+
+        Args:
+            folder: Folder of the files.
+
+        Returns:
+            This analysis.
+        """
+        folder = make_folder(folder)
+        self.paths = []
+        for name, text in self._encode_files().items():
+            self.paths.append(folder / name)
+            write_whole(self.paths[-1], text, force=True)
+        figures = self._draw_figures()
+        page = folder / "report.md"
+        write_whole(page, self.compose_page(list(figures)), force=True)
+        self.paths.append(page)
+        for name, figure in figures.items():
+            self.paths.append(folder / f"{name}.png")
+            style.write_figure(figure, self.paths[-1], style.REPORT_DPI)
+        return self
+
+    def _encode_files(self) -> dict[str, str]:
+        """Returns the contents of the text files by file name."""
+        tables = {
+            "conditions.csv": self._list_means(),
+            "comparisons.csv": self.to_rows(),
+        }
+        optional_tables = {
+            "completion_times.csv": to_table(self.times),
+            "completion_comparisons.csv": to_table(self.time_comparisons),
+            "missing_answers.csv": [answers._asdict() for answers in self.missing_answers],
+        }
+        tables |= {name: rows for name, rows in optional_tables.items() if rows}
+        texts: dict[str, str] = {}
+        for name, rows in tables.items():
+            flat_rows = [dict(_flatten(row)) for row in rows]
+            texts[name] = encode_csv(flat_rows)
+        texts["methods.txt"] = f"{self.methods}\n"
+        texts["analysis.json"] = json.dumps(self.to_dict(), indent=1) + "\n"
+        return texts
+
+    def _draw_figures(self) -> dict[str, Any]:
+        """Draws the figures, and returns them by name."""
+        figures = {
+            name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means
+        }
+        if self.time_comparisons:
+            figures[COMPLETION] = draw_times(self.rows, self._limit_s, unit=self.unit)
+        if len({row["trial"] for row in self.learning_rows}) > 1:
+            protocol = self._experiment.plan.protocol
+            measure = "difference" if protocol.staircase else protocol.task.learning_measure
+            limit_s = self._limit_s if self._is_censored(measure) else None
+            figures["learning"] = draw_learning(
+                self.learning_rows, measure, unit=self.unit, limit_s=limit_s
+            )
+        return figures
+
+    def compose_page(self, figures: Sequence[str]) -> str:
+        """Composes the Markdown page that reports the results of the experiment.
+
+        Args:
+            figures: Names of the PNG files beside the page, without the suffix.
+
+        Returns:
+            The text of the page.
+        """
+        protocol = self._experiment.plan.protocol
+        parts = [f"# {protocol.title or protocol.name}"]
+        for block in compose(self):
+            if isinstance(block, TextTable):
+                text = block.markdown()
+            else:
+                text = "\n".join(block.lines())
+            if text.strip():
+                parts.append(text)
+        parts += [f"![{name}]({name}.png)" for name in figures]
+        return "\n\n".join(parts) + "\n"
+
+    def fit_models(self) -> Iterator[MixedModel]:
+        """Fits mixed models to the mean and the peak force of users who act in pairs.
+
+        A mixed model accounts for the fact that the two users of a pair are not independent.
+
+        Yields:
+            One model for each of the two measures, as soon as it is fitted. There are none if
+            participants act alone, if there are too few pairs, or if the package statsmodels is
+            not installed.
+        """
+        pairs = {row[self.unit] for row in self.rows}
+        if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
+            return
+        for measure in ("force_mean", "force_peak"):
+            # A trial of a pair becomes a row for each of the two users.
+            rows: list[Row] = []
+            for row in self.rows:
+                for user, name in enumerate(row["pair"].split("-"), 1):
+                    force_n = row[f"{measure}_user{user}_n"]
+                    rows.append({**row, "participant": name, f"{measure}_n": force_n})
+            # With too few pairs there is no model.
+            with suppress(UsageError):
+                yield fit_mixed_model(rows, f"{measure}_n")
+
+    def _list_means(self) -> list[dict[str, Any]]:
+        """Returns a row for each measure and condition."""
+        rows: list[dict[str, Any]] = []
+        for measure, means in self.means.items():
+            rows += [{"measure": measure, **mean._asdict()} for mean in means]
+        return rows
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the comparisons as a table, one row per measure and pair of conditions."""
+        return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns all results of the experiment as plain values.
+
+        These are the means of the conditions, their comparisons, completion times, missing
+        answers, fitted models and the methods paragraph. `trilat experiment analyse --json`
+        prints them.
+        """
+        models = {model.measure: model._asdict() for model in self.models}
+        for model in models.values():
+            model["effects"] = [effect._asdict() for effect in model["effects"]]
+        return {
+            "name": self._experiment.plan.protocol.name,
+            "digest": self._experiment.plan.digest,
+            "conditions": self._list_means(),
+            "comparisons": self.to_rows(),
+            "completion_times": to_table(self.times),
+            "completion_comparisons": to_table(self.time_comparisons),
+            "missing_answers": [answers._asdict() for answers in self.missing_answers],
+            "absent": self.absent,
+            "mixed_models": models,
+            "methods": self.methods,
+        }
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat experiment analyse` prints.
+
+        The parts are a summary of completed trials, the means and comparisons of the measures,
+        the fitted models, the number of missing questionnaire answers, the reasons why a
+        measure has no number, and the methods paragraph. With a single participant or pair
+        there are no comparisons, and one table has all measures.
+        """
+        yield from self._write_time_blocks()
+        units = {row[self.unit] for row in self.rows}
+        if len(units) > 1:
+            yield from self._write_measure_blocks()
+        else:
+            yield from self._write_single_unit_block(next(iter(units)))
+        yield from self._write_model_blocks()
+        for answers in self.missing_answers:
+            condition = f", {answers.condition}" if answers.condition else ""
+            unscored = ""
+            if answers.missing:
+                unscored = (
+                    f"; {answers.unscored} of {answers.forms} have no score for that reason"
+                )
+            yield (
+                f"{answers.questionnaire}{condition}: {answers.missing} of "
+                f"{count_nouns(answers.asked, 'answer is', 'answers are')} missing{unscored}"
+            )
+        for measure, reason in self.absent.items():
+            yield f"{measure}: no number, because {reason}"
+        if self.missing_answers or self.absent:
+            yield ""
+        yield self.methods
+
+    def _write_time_blocks(self) -> Iterator[Block]:
+        """Yields the numbers of completed trials, and the completion times."""
+        if not self.times:
+            return
+        yield (
+            f"{COMPLETION}, median over {self.unit}s of the median of each {self.unit}'s trials"
+        )
+        yield "a trial that was not completed counts as longer than all others"
+        rows = [
+            (
+                time.condition,
+                str(time.trials),
+                str(time.timed_out),
+                str(time.censored - time.timed_out),
+                str(time.number),
+                NOT_REACHED if time.median is None else f"{time.median:.4g}",
+                _format_interval(time.interval),
+            )
+            for time in self.times
+        ]
+        heads = ("condition", "trials", "timed out", "failed sooner", "n", "median", "interval")
+        yield TextTable(heads, rows, align="lrrrrrl")
+        yield ""
+        if self.time_comparisons:
+            comparison_rows = [
+                (
+                    f"{test.second} - {test.first}",
+                    f"{test.longer} of {test.number}",
+                    f"{test.shorter} of {test.number}",
+                    format_number(test.difference),
+                    format_number(test.p),
+                    format_number(test.p_holm),
+                )
+                for test in self.time_comparisons
+            ]
+            columns = ("difference", "longer", "shorter", "median", "p, sign test", "p, Holm")
+            yield TextTable(columns, comparison_rows, align="lrrrrr")
+            yield ""
+
+    def _write_measure_blocks(self) -> Iterator[Block]:
+        """Yields a table of conditions and a table of comparisons for each measure."""
+        for measure, means in self.means.items():
+            yield f"{measure}, mean over {self.unit}s, {100 * CONFIDENCE:g} % interval"
+            rows = [
+                (
+                    mean.condition,
+                    str(mean.number),
+                    str(mean.missing),
+                    f"{mean.mean:.4g}",
+                    _format_interval(mean.interval),
+                )
+                for mean in means
+            ]
+            heads: tuple[str, ...] = ("condition", "n", "missing", "mean", "interval")
+            yield TextTable(heads, rows, align="lrrrl")
+            yield ""
+            comparison_rows = [
+                (
+                    f"{test.second} - {test.first}",
+                    format_number(test.difference),
+                    _format_interval(test.interval),
+                    format_number(test.t),
+                    format_number(test.p_holm),
+                    format_number(test.d_z),
+                )
+                for test in self.comparisons[measure]
+            ]
+            if comparison_rows:
+                heads = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
+                yield TextTable(heads, comparison_rows, align="lrlrrr")
+                yield ""
+
+    def _write_model_blocks(self) -> Iterator[Block]:
+        """Yields a table of effects for each mixed model."""
+        for model in self.models:
+            yield f"{model.measure} of each user, mixed model against {model.reference}"
+            rows = [
+                (
+                    effect.condition,
+                    f"{effect.estimate:.4g}",
+                    _format_interval(effect.interval),
+                    format_number(effect.t),
+                    format_number(effect.p),
+                )
+                for effect in model.effects
+            ]
+            yield TextTable(("condition", "effect", "interval", "t", "p"), rows, align="lrlrr")
+            yield ""
+
+    def _write_single_unit_block(self, unit: str) -> Iterator[Block]:
+        """Yields a table of all measures, with a column for each condition.
+
+        Args:
+            unit: Name of the only participant or pair.
+        """
+        conditions = list(dict.fromkeys(row["condition"] for row in self.rows))
+        yield (
+            f"means over the trials of a condition; one {self.unit}, {unit}, "
+            "allows no interval and no test"
+        )
+        rows = []
+        for measure, means in self.means.items():
+            by_condition = {mean.condition: _describe_mean(mean) for mean in means}
+            rows.append((measure, *(by_condition.get(name, "-") for name in conditions)))
+        yield TextTable(("measure", *conditions), rows, align="l" + "r" * len(conditions))
+        yield ""
+
+
+def analyse_experiment(
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    exclude: Mapping[str, str] = {},
+) -> ExperimentAnalysis:
+    """Computes the statistics of an experiment and writes them into its folder.
+
+    The command is `trilat experiment analyse`.
+
+    >>> analysis = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
+    >>> near, *_ = analysis.means["completion_s"]  # doctest: +SKIP
+    >>> near.interval  # doctest: +SKIP
+    (3.06, 3.22)
+
+    Args:
+        folder: Folder of the experiment.
+        out: Folder for tables and figures. By default the folder `analysis` in the experiment's
+            folder.
+        exclude: Participants or pairs whose data do not count, with the reasons.
+
+    Raises:
+        UsageError: There is no experiment, no trial is done, or an excluded participant or pair
+            does not exist.
+    """
+    experiment = open_experiment(folder)
+    analysis = ExperimentAnalysis(experiment, exclude)
+    if out is None:
+        return analysis.write(make_subfolder(experiment.folder / FOLDER))
+    return analysis.write(Path(out))
+
+
+class PowerOfExperiment(Result):
+    """Number of participants that an experiment needs to detect an effect of a given size.
+
+    The power is the probability that the test finds an effect that exists.
+
+    Args:
+        d_z: Size of the effect.
+        participants: Planned number of participants, or None.
+        seed: Seed of the simulated experiments.
+
+    Attributes:
+        d_z: Size of the effect: mean over standard deviation of the differences within
+            participants.
+        least: Smallest number of participants for each desired power.
+        participants: Planned number of participants. None without a plan.
+        power: Power with the planned number, by the noncentral t distribution.
+        simulated: Power with the planned number from simulated experiments, with its 95 %
+            interval.
+    """
+
+    def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
+        self.d_z = d_z
+        self.participants = participants
+        self.least = {
+            wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)
+        }
+        self.power: float | None = None
+        self.simulated: SimulatedPower | None = None
+        if participants is not None:
+            self.power = power(d_z, participants)
+            # The difference of two trials has sqrt(2) times the deviation of a trial: 1.
+            means = {"first": 0.0, "second": d_z}
+            deviation = 0.5**0.5
+            (self.simulated,) = simulate_power(
+                means, participants, trial_deviation=deviation, seed=seed
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values for `trilat experiment power --json`.
+
+        These are the effect size, the participants needed for each statistical power, and the
+        power that the planned number of participants gives, both computed and simulated.
+        """
+        simulated = None if self.simulated is None else self.simulated._asdict()
+        least = [
+            {"power": wanted, "participants": number} for wanted, number in self.least.items()
+        ]
+        return {
+            "d_z": self.d_z,
+            "least": least,
+            "participants": self.participants,
+            "power": self.power,
+            "simulated": simulated,
+        }
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat experiment power` prints.
+
+        A table shows how many participants are needed for each statistical power, which is the
+        probability of finding a true effect. If a number of participants is planned, a sentence
+        follows with the power that this number gives.
+        """
+        yield (
+            "paired comparison of two conditions, two-sided, alpha 0.05, "
+            f"effect d_z {self.d_z:g}"
+        )
+        rows = [(f"{wanted:g}", str(number)) for wanted, number in self.least.items()]
+        yield TextTable(("power", "participants"), rows, align="rr")
+        if self.power is not None and self.simulated is not None:
+            interval = _format_interval(self.simulated.interval)
+            simulated = f"{self.simulated.found:.3f} {interval} of 500 drawn experiments"
+            yield (
+                f"with {count_nouns(self.participants, 'participant')}: power "
+                f"{self.power:.3f}; found in {simulated}"
+            )
+
+
+def compute_experiment_power(
+    effect: float, participants: int | None = None, *, seed: int = 1
+) -> PowerOfExperiment:
+    """Computes the number of participants that an effect needs.
+
+    The command is `trilat experiment power`.
+
+    >>> tn.compute_experiment_power(0.5).least[0.8]
+    34
+
+    Args:
+        effect: Mean over standard deviation of the differences within participants, Cohen's
+            d_z.
+        participants: Planned number of participants, whose power is computed and simulated.
+        seed: Seed of the simulated experiments.
+
+    Raises:
+        UsageError: The effect needs more participants than `find_least_number` tries.
+    """
+    return PowerOfExperiment(effect, participants, seed)
+
+
+def _describe_mean(mean: ConditionMean) -> str:
+    """Returns a mean as text, with the number of missing values if there are any."""
+    missing = f" ({mean.missing} missing)" if mean.missing else ""
+    return f"{mean.mean:.4g}{missing}"
+
+
+def _list_points(rows: Sequence[Row], name: str) -> Array:
+    """Returns a point of each trial, in m, shape (K, 2).
+
+    Args:
+        rows: The K trials.
+        name: Name of the point: "start", "target" or "end".
+    """
+    return np.array([[row[f"{name}_{axis}_m"] for axis in "xy"] for row in rows])
+
+
+def _format_interval(interval: tuple[float, float | None] | None) -> str:
+    """Returns an interval as text. An upper end of None was not reached."""
+    if interval is None:
+        return "-"
+    low, high = interval
+    upper = NOT_REACHED if high is None else f"{high:.4g}"
+    return f"[{low:.4g}, {upper}]"
+
+
+def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yields the cells of a row. An interval has a cell for each end."""
+    for key, value in row.items():
+        if key in ("interval", "bootstrap"):
+            low, high = value or (None, None)
+            yield f"{key}_low", low
+            yield f"{key}_high", high
+        else:
+            yield key, value

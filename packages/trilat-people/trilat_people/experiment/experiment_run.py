@@ -1,0 +1,592 @@
+"""Runs an experiment and keeps its results in a folder: logs, journals and tables.
+
+`begin_experiment` creates the folder. `Experiment.run` runs the remaining trials with synthetic
+participants, which are models of people. `trilat experiment run --live` runs them with people.
+A journal is a file to which each finished trial is appended, so that an interrupted experiment
+can be continued.
+
+Invariant:
+    - A folder belongs to the plan whose digest it contains.
+    - A trial in the journal is never run again, and an interrupted trial is repeated as a
+      whole. Nothing is stored twice or lost, whenever the process was killed.
+    - The tables follow from the journals.
+    - People and synthetic participants never share a folder.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from trilat_net.errors import UsageError, count_nouns
+from trilat_net.files import digest_file, make_results_folder, make_subfolder, write_whole
+from trilat_net.presentation.result_text import Block, TextTable
+from trilat_net.results import Result
+from trilat_net.scenario import parse_scenario
+from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work.study_folder import RunJournal, build_resume_hint, encode_csv
+
+from .completion_times import COMPLETION, find_median, is_completed
+from .protocol import Choices, ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
+from .questionnaires import CHOICE, find_form
+from .staircase import COMPARISON, Staircase
+from .trial_run import TrialEntry, run_trial
+
+PROTOCOL_FILE = "protocol.toml"
+PLAN_FILE = "protocol.json"
+JOURNAL_FILE = "trials.journal"
+NOTES_FILE = "notes.journal"
+TRIALS_FILE = "trials.csv"  # fmt: skip
+LOGS = "logs"
+
+
+class Note(msgspec.Struct, frozen=True):
+    """An event of an experiment with people that is not a finished trial.
+
+    The event is a consent, the answers to a questionnaire, or an aborted trial. Events are
+    stored in a journal of their own.
+
+    Attributes:
+        cell: Unique key of the event. It names the step of the experiment and the participant,
+            or the aborted trial.
+        kind: "consent", "questionnaire" or "aborted".
+        who: Pseudonym of the participant. If a trial was aborted, the pseudonyms of all its
+            participants.
+        number: Number of the trial to which the event belongs.
+        unix_s: Time on the machine's clock, in s.
+        text: Name of a questionnaire, or the reason why a trial was aborted.
+        answers: Answers by item. None for a missing answer.
+        seed: Always 0. The field exists because journal entries of other studies have a seed.
+    """
+
+    cell: str
+    kind: str
+    who: str
+    number: int
+    unix_s: float
+    text: str = ""
+    answers: dict[str, float | None] = {}
+    seed: int = 0
+
+
+class _ExperimentStatus(NamedTuple):
+    """How many trials of an experiment are done, and which one is next.
+
+    Attributes:
+        done: Number of trials in the journal.
+        total: Number of trials of the plan.
+        next: The first trial that is not done. None if all are done.
+    """
+
+    done: int
+    total: int
+    next: PlannedTrial | None
+
+
+class Experiment(Result):
+    """An experiment in its folder, which contains its plan, journals, logs and tables.
+
+    `begin_experiment` and `open_experiment` create this object.
+
+    Args:
+        folder: Folder with the plan, journals and logs of the experiment.
+        plan: The protocol and its trials.
+
+    Attributes:
+        folder: Folder with the plan, journals and logs of the experiment.
+        plan: The protocol and its trials.
+        unit: "pair" if two participants take part together, otherwise "participant".
+    """
+
+    def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
+        self.folder = folder
+        self.plan = plan
+        self.unit = "pair" if len(plan.protocol.users) > 1 else "participant"
+        self._remedy = build_resume_hint("experiment", "run", str(folder))
+
+    def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
+        """Opens the journal with the results of the finished trials.
+
+        An experiment must not mix trials of people with trials of synthetic participants, which
+        are models of people. Therefore a caller who wants to add trials declares their kind
+        here.
+
+        Args:
+            people: True to add trials of people, False to add trials of synthetic participants.
+                None to read only.
+
+        Raises:
+            UsageError: The finished trials are of the other kind.
+        """
+        if people is not None:
+            entries = self.read_entries().values()
+            if any(entry.people != people for entry in entries):
+                advice = "people: continue with"
+                if people:
+                    advice = "synthetic participants: continue without"
+                raise UsageError(
+                    f"{self.folder}: the finished trials were done by {advice} --live, "
+                    "or start another experiment"
+                )
+        return RunJournal(
+            self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy
+        )
+
+    def open_notes(self) -> RunJournal[Note]:
+        """Opens the journal file of all events of the experiment that are not finished trials.
+
+        The events are consents, answers to questionnaires, and aborted trials. Use the returned
+        journal in a `with` statement to read events or to append new events.
+        """
+        return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
+
+    def read_entries(self) -> dict[int, TrialEntry]:
+        """Returns the results of the finished trials, by their numbers in the plan."""
+        with self.open_trials() as journal:
+            return {entry.cell: entry for entry in journal.done.values()}
+
+    def read_notes(self) -> list[Note]:
+        """Returns what people did besides finished trials, in the order of time.
+
+        Each entry is a consent, the answers to a questionnaire, or a trial that was aborted.
+        Empty if nothing has been noted yet.
+        """
+        if not (self.folder / NOTES_FILE).exists():
+            return []
+        with self.open_notes() as journal:
+            return list(journal.done.values())
+
+    def list_choices(self) -> Choices:
+        """Returns which trial participants chose in each pair of a staircase.
+
+        A staircase presents pairs of trials, and asks in which one the difference was larger.
+        """
+        if self.plan.protocol.staircase is None:
+            return {}
+        choices: dict[int, float] = {}
+        for note in self.read_notes():
+            choice = note.answers[CHOICE] if note.text == CHOICE else None
+            if choice is not None:
+                choices[note.number] = choice
+        return choices
+
+    def _draw_choices(self, staircase: Staircase) -> None:
+        """Notes the choices of synthetic participants for all pairs of a staircase.
+
+        A staircase is a perception test with pairs of trials. A quantity has its standard value
+        in one trial of a pair, and a larger value in the other one, the comparison trial. After
+        the second trial, the participant chooses the trial with the larger value. The
+        difference of a pair depends on whether the earlier choices of the block were right.
+
+        The choices follow from the plan. Therefore the choices can be drawn before any trial is
+        run.
+
+        Args:
+            staircase: Settings of the test. It also contains the model of the participant's
+                perception, which sometimes errs.
+        """
+        choices: dict[
+            int, float
+        ] = {}  # chosen trial, 1 or 2, by the number of the second trial
+        with self.open_notes() as notes:
+            for step in self.plan.list_steps():
+                is_choice = step.form is not None and step.form.name == CHOICE
+                if not is_choice:
+                    continue
+                second_trial = step.planned
+                were_right = self.plan.judge_choices(second_trial, choices)
+                # The last difference is that of this pair, whose choice is not made yet.
+                difference = staircase.list_differences(were_right)[-1]
+                comparison_trial = 2 if second_trial.phase == COMPARISON else 1
+                choice = staircase.draw_choice(difference, comparison_trial, second_trial.seed)
+                choices[second_trial.number] = choice
+                who = "-".join(second_trial.group)
+                note = Note(
+                    cell=f"{step.key} {who}",
+                    kind=step.kind,
+                    who=who,
+                    number=second_trial.number,
+                    unix_s=0.0,
+                    text=CHOICE,
+                    answers={CHOICE: choice},
+                )
+                notes.add(note)
+
+    def status(self) -> _ExperimentStatus:
+        """Returns how many trials are done, and which trial is next."""
+        done = self.read_entries()
+        remaining = [trial for trial in self.plan.trials if trial.number not in done]
+        next_trial = remaining[0] if remaining else None
+        return _ExperimentStatus(len(done), len(self.plan.trials), next_trial)
+
+    def run(
+        self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
+    ) -> "Experiment":
+        """Runs the remaining trials of the experiment with simulated people.
+
+        A simulated person, or synthetic participant, is a model that moves the arms like a
+        person. The trials run in virtual time. Trials that are in the journal already are not
+        repeated. In the end, the tables of the experiment are written.
+
+        Args:
+            jobs: Number of processes. None uses one process per core.
+            show: Function that is called with the numbers of finished and of all trials.
+            on: Address of a Dask scheduler, or an executor that runs the trials. None uses
+                processes on this machine.
+
+        Returns:
+            This experiment.
+        """
+        logs = make_subfolder(self.folder / LOGS)
+        plan = self.plan
+        with self.open_trials(people=False) as journal:
+            if plan.protocol.staircase is not None:
+                self._draw_choices(plan.protocol.staircase)
+            choices = self.list_choices()
+            done = {entry.cell for entry in journal.done.values()}
+            tasks = []
+            for trial in plan.trials:
+                if trial.number not in done:
+                    text = plan.find_scenario(trial, choices).text
+                    tasks.append((plan.protocol, text, trial, plan.digest, logs))
+            with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
+                journal.run_pending(pool, run_trial, tasks, len(done), len(plan.trials), show)
+        self.write_tables()
+        return self
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the table of finished trials, one row per trial, in the order of the plan.
+
+        A row contains the participants, the condition and the measures of the trial.
+        """
+        done = self.read_entries()
+        choices = self.list_choices()
+        rows = []
+        for planned in self.plan.trials:
+            entry = done.get(planned.number)
+            if entry is not None:
+                rows.append(self._describe_trial(planned, entry, choices))
+        return rows
+
+    def _describe_trial(
+        self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
+    ) -> dict[str, Any]:
+        """Returns the row of a trial: its place in the plan, result, measures and log."""
+        row: dict[str, Any] = {
+            "trial_number": planned.number,
+            self.unit: "-".join(planned.group),
+            "condition": planned.condition,
+            "block": planned.block,
+            "trial": planned.trial,
+            "practice": int(planned.practice),
+        }
+        if planned.phase:
+            row["phase"] = planned.phase
+        if self.plan.protocol.staircase is not None:
+            row |= self._describe_pair(planned, choices)
+        return {
+            **row,
+            "catch": int(planned.catch),
+            "people": int(entry.people),
+            "succeeded": int(entry.succeeded),
+            **entry.measures,
+            "log": f"{LOGS}/{planned.file}",
+            "log_sha256": entry.sha256,
+        }
+
+    def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
+        """Returns the columns of a trial in a staircase. Practice trials have no values."""
+        if planned.practice:
+            return {"difference": None, "right": None}
+        difference, right = self.plan.find_pair(planned, choices)
+        return {"difference": difference, "right": None if right is None else int(right)}
+
+    def list_answers(self) -> list[dict[str, Any]]:
+        """Returns a row for each item of a questionnaire that people have completed.
+
+        The value of a missing answer is None.
+        """
+        rows: list[dict[str, Any]] = []
+        for columns, note in self._read_answer_notes():
+            for item, value in note.answers.items():
+                row = {
+                    **columns,
+                    "questionnaire": note.text,
+                    "item": item,
+                    "value": value,
+                    "unix_s": note.unix_s,
+                }
+                rows.append(row)
+        return rows
+
+    def list_scores(self) -> list[dict[str, Any]]:
+        """Returns the scores of the completed questionnaires, one row per questionnaire.
+
+        The score is under the name of the questionnaire. It is None if an answer is missing.
+        """
+        forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
+        rows: list[dict[str, Any]] = []
+        for columns, note in self._read_answer_notes():
+            form = forms.get(note.text)
+            if form is not None:
+                rows.append({**columns, note.text: form.score(note.answers)})
+        return rows
+
+    def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
+        """Yields the notes with answers, each with the first columns of its row."""
+        conditions: dict[tuple[tuple[str, ...], int], str] = {}
+        for trial in self.plan.trials:
+            if not trial.catch:
+                conditions[trial.group, trial.block] = trial.condition
+        for note in self.read_notes():
+            if not note.answers:
+                continue
+            planned = self.plan.trials[note.number - 1]
+            row = {
+                self.unit: "-".join(planned.group),
+                "participant": note.who,
+                "condition": conditions[planned.group, planned.block],
+                "block": planned.block,
+            }
+            yield row, note
+
+    def write_tables(self) -> Path:
+        """Writes the results as CSV tables into the folder of the experiment.
+
+        The file trials.csv has a row for each trial, with the digest of its log. An experiment
+        with people also has the files questionnaires.csv, and events.csv with the consents and
+        the aborted trials.
+
+        Returns:
+            The path of trials.csv.
+        """
+        events = [
+            {
+                "unix_s": note.unix_s,
+                "event": note.kind,
+                "who": note.who,
+                "trial_number": note.number,
+                "text": note.text,
+            }
+            for note in self.read_notes()
+        ]
+        tables = {
+            TRIALS_FILE: self.to_rows(),
+            "questionnaires.csv": self.list_answers(),
+            "events.csv": events,
+        }
+        for name, rows in tables.items():
+            if rows or name == TRIALS_FILE:
+                text = encode_csv(rows)
+                write_whole(self.folder / name, text, force=True, remedy=self._remedy)
+        return self.folder / TRIALS_FILE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the progress, which `trilat experiment status --json` prints."""
+        status = self.status()
+        protocol = self.plan.protocol
+        return {
+            "name": protocol.name,
+            "digest": self.plan.digest,
+            "folder": str(self.folder),
+            "groups": len(protocol.groups),
+            "conditions": list(protocol.conditions),
+            "trials": status.total,
+            "done": status.done,
+        }
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text about the progress, with a table of the conditions.
+
+        The table states the median completion time of each condition, in which a trial that was
+        not completed counts as longer than any other.
+        """
+        status = self.status()
+        rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
+        total = count_nouns(status.total, "trial")
+        yield f"{self.plan.protocol.name}: {status.done} of {total}, in {self.folder}"
+        table: list[tuple[str, ...]] = []
+        for condition in self.plan.protocol.conditions:
+            trials = [row for row in rows if row["condition"] == condition]
+            if trials:
+                completed = sum(map(is_completed, trials))
+                counts = [str(len(trials)), str(completed), _describe_median(trials)]
+                means = [_describe_mean(trials, measure) for measure in _SHOWN_MEASURES]
+                table.append((condition, *counts, *means))
+        heads = ("condition", "trials", "completed", "completion_s, median", *_SHOWN_MEASURES)
+        yield TextTable(heads, table, align="l" + "r" * (len(heads) - 1))
+        trial = status.next
+        if trial is not None:
+            yield f"next: trial {trial.number}, {', '.join(trial.group)}, {trial.condition}"
+        for note in self.read_notes():
+            if note.kind == "aborted":
+                trial_name = f"trial {note.number}, {note.who}"
+                yield f"{trial_name}, was aborted and is repeated: {note.text}"
+
+
+_SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
+"""Measures whose means the text of the status shows."""
+
+
+def _describe_mean(rows: list[dict[str, Any]], measure: str) -> str:
+    """Returns the text of the mean of a measure over trials."""
+    mean = sum(row[measure] for row in rows) / len(rows)
+    return f"{mean:.3g}"
+
+
+def _describe_median(rows: list[dict[str, Any]]) -> str:
+    """Returns the text of the median completion time of trials, in s."""
+    times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
+    median_s = find_median(times_s)
+    return f"{median_s:.3g}" if math.isfinite(median_s) else "not reached"
+
+
+def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
+    """Writes a protocol with comments, ready to run, as `trilat experiment new` does.
+
+    >>> tn.new_experiment("reaching.toml").name
+    'reaching.toml'
+
+    Args:
+        file: the path of the protocol.
+        pair: whether two people hold a master each; otherwise one person does.
+        force: whether an existing file may be replaced.
+
+    Raises:
+        UsageError: the file exists.
+    """
+    template_name = "experiment_pair.txt" if pair else "experiment.txt"
+    template = resources.files(__package__) / template_name
+    write_whole(Path(file), template.read_text(encoding="utf-8"), force=force)
+    return Path(file)
+
+
+def check_experiment(file: str | Path) -> ExperimentPlan:
+    """Checks the protocol of an experiment with people, and plans all of its trials.
+
+    The command is `trilat experiment check`.
+
+    >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
+    240
+
+    Args:
+        file: Path of the protocol, a TOML file with the conditions, the task, and the numbers
+            of participants and trials.
+
+    Returns:
+        The plan, which lists every trial in its order.
+
+    Raises:
+        UsageError: The protocol cannot be carried out. The error lists all problems.
+    """
+    return plan_experiment(read_protocol(file), Path(file).parent)
+
+
+def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
+    """Creates the folder of an experiment, by default runs/experiment-NAME-N.
+
+    The folder contains the protocol, and the plan with the scenarios as JSON.
+
+    Args:
+        file: File of the protocol.
+        out: The folder. None for the default.
+    """
+    plan = check_experiment(file)
+    default_name = f"experiment-{plan.protocol.name}"
+    out_path = None if out is None else Path(out)
+    folder = make_results_folder(out_path, default_name, force=None)
+    write_whole(folder / PROTOCOL_FILE, Path(file).read_text(encoding="utf-8"))
+    facts = {
+        "digest": plan.digest,
+        "protocol": msgspec.to_builtins(plan.protocol),
+        "trials": [{**trial._asdict(), "log": f"{LOGS}/{trial.file}"} for trial in plan.trials],
+        "scenarios": {name: scenario.text for name, scenario in plan.scenarios.items()},
+    }
+    write_whole(folder / PLAN_FILE, json.dumps(facts, indent=1) + "\n")
+    return Experiment(folder, plan)
+
+
+def open_experiment(folder: str | Path) -> Experiment:
+    """Opens the experiment in a folder, as `trilat experiment status` does.
+
+    >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
+    240
+
+    Raises:
+        UsageError: The folder contains no experiment, or its plan was changed.
+    """
+    path = Path(folder)
+    try:
+        facts = json.loads((path / PLAN_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise UsageError(
+            f"{path}: contains no experiment; "
+            "start an experiment with `trilat experiment run FILE`"
+        ) from None
+    scenarios = {}
+    for name, text in facts["scenarios"].items():
+        scenarios[name] = parse_scenario(text, str(path))
+    protocol = read_protocol(path / PROTOCOL_FILE)
+    plan = plan_experiment(protocol, scenarios=scenarios)
+    if plan.digest != facts["digest"]:
+        raise UsageError(
+            f"{path}: the protocol was changed after the experiment began; "
+            "start another experiment"
+        )
+    return Experiment(path, plan)
+
+
+def run_experiment(
+    source: str | Path,
+    out: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    on: Workers = None,
+    progress: Callable[[int, int], None] = ignore_progress,
+) -> Experiment:
+    """Runs an experiment with synthetic participants, as `trilat experiment run` does.
+
+    >>> done = tn.run_experiment(tn.new_experiment("reach.toml"), "reach")  # doctest: +SKIP
+    >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
+
+    Args:
+        source: File of a protocol, or the folder of an experiment to continue.
+        out: Folder of the experiment. By default the first of runs/experiment-NAME-N that does
+            not exist.
+        jobs: Number of processes. None for one per core.
+        on: Address of a Dask scheduler, or an executor that runs the trials.
+        progress: Function that is called with the numbers of finished and of all trials.
+
+    Raises:
+        UsageError: The protocol cannot be carried out, or the folder contains something else.
+    """
+    if Path(source).is_dir():
+        experiment = open_experiment(source)
+    else:
+        experiment = begin_experiment(source, out)
+    return experiment.run(jobs, progress, on)
+
+
+def list_log_problems(experiment: Experiment) -> Iterator[str]:
+    """Finds finished trials whose log is missing or was changed since the trial.
+
+    Args:
+        experiment: The experiment in its folder.
+
+    Yields:
+        A sentence for each such trial.
+    """
+    done = experiment.read_entries()
+    for planned in experiment.plan.trials:
+        entry = done.get(planned.number)
+        path = experiment.folder / LOGS / planned.file
+        if entry is None:
+            continue
+        if not path.exists():
+            yield f"{path}: is missing"
+        elif digest_file(path) != entry.sha256:
+            yield f"{path}: is not the log that the trial wrote"

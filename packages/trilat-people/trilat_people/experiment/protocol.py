@@ -1,0 +1,892 @@
+"""Reads the protocol of an experiment with people, and plans its trials.
+
+A protocol is a TOML file. It names the scenario (the robot arms and their network), the
+conditions (keys of the scenario with different values), the task, and the number of
+participants and trials. The plan lists all trials in their order. Orders of conditions are
+balanced over the participants, so that practice and fatigue affect all conditions alike, and
+targets are drawn.
+
+Invariant:
+    - The plan follows from the protocol and from the scenarios of its conditions.
+    - The digest of the plan covers the protocol and the text of the scenario of each condition.
+      The log of each trial contains the digest, which proves that the trial follows the plan.
+    - A protocol that cannot be carried out is refused as a whole, with a list of all problems.
+"""
+
+import hashlib
+import itertools
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta, field
+from msgspec.structs import replace
+
+from trilat_net.errors import ScenarioError, TrilatError, UsageError, count_nouns
+from trilat_net.fields import Frozen, Positive
+from trilat_net.presentation.result_text import Block, TextTable
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario, load_scenario
+
+from .questionnaires import Name, Questionnaire, find_form
+from .staircase import COMPARISON, STANDARD, Staircase
+from .synthetic_participant import ParticipantModel, Share
+from .tasks import AnyTask, ReachTrial
+
+Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
+"""A waiting time, in s."""
+Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}\Z")]
+"""Name of a participant, which becomes part of file names."""
+Count = Annotated[int, Meta(ge=1, le=1000)]
+Counted = Annotated[int, Meta(ge=0, le=1000)]
+Feedback = Literal[
+    "completion_s",
+    "movement_s",
+    "reaction_s",
+    "error_end_mm",
+    "error_rms_mm",
+    "path_m",
+    "wall_force_n",
+]
+
+
+class _CatchTrials(Frozen, frozen=True):
+    """Trials of an unexpected condition that are mixed into a block of another condition.
+
+    They keep participants from anticipating what the next trial is like. They do not count in
+    the analysis.
+
+    Attributes:
+        condition: Condition of the catch trials. Blocks of this condition have no catch trials.
+        share: Number of catch trials in a block, as a fraction of the counted trials of the
+            block. The number is rounded.
+    """
+
+    condition: Name
+    share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.1
+
+
+class _Training(Frozen, frozen=True):
+    """Training in which the authority over the slave arm moves from an expert to a learner.
+
+    The first user is the expert, the second user the learner.
+
+    Attributes:
+        lead: For each condition, the expert's part of the users' authority in the first and in
+            the last trial of the training, from 0 to 1.
+        before: Number of trials of the learner alone before the training.
+        after: Number of trials of the learner alone right after the training (transfer).
+        retention: Number of trials of the learner alone after a rest (retention).
+        rest_s: Rest before the retention trials, in s.
+    """
+
+    lead: dict[Name, tuple[Share, Share]]
+    before: Counted = 2
+    after: Counted = 2
+    retention: Counted = 0
+    rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
+
+    def describe(self) -> str:
+        """Describes how the authority over the slave moved from the expert to the learner.
+
+        Returns:
+            A sentence for the methods section of a paper.
+        """
+        courses: list[str] = []
+        for condition, (first, last) in self.lead.items():
+            courses.append(f"{first:g} to {last:g} ({condition})")
+        retention = ""
+        if self.retention:
+            retention = f", and {self.retention} more after {self.rest_s:g} s"
+        return (
+            f"In these the expert's part of the authority went from {', '.join(courses)}; "
+            f"{count_nouns(self.before, 'trial')} before and "
+            f"{self.after} after them{retention} were made without it and are compared"
+        )
+
+
+class Protocol(Frozen, frozen=True):
+    """Protocol of an experiment. The attributes are the keys of its TOML file.
+
+    Attributes:
+        name: Name of the experiment.
+        title: Title of the experiment for people.
+        scenario: Name or path of the scenario on which all conditions are based.
+        users: Names of the sites whose arms participants hold. Two sites are held by a pair.
+        participants: Number of participants, or their pseudonyms.
+        design: How the order of conditions is balanced over participants, see
+            docs/reference/experiment-protocol.md.
+        trials: Number of counted trials of a block. A block has all trials of a condition.
+        practice: Number of practice trials before the counted trials of a block.
+        foreperiod_s: Shortest and longest time from the start of a trial until its target
+            appears, in s. The time is drawn uniformly.
+        seed: Seed of orders, targets and synthetic participants.
+        set: Scenario keys with the same value in all conditions.
+        conditions: For each condition by name, the scenario keys that it sets.
+        task: Task of the participants.
+        model: Parameters of synthetic participants.
+        consent: Text to which people agree before their first trial. Empty to request no
+            consent.
+        questionnaires: The questionnaires, and when people answer them.
+        rest_s: Shortest rest between two blocks, in s.
+        feedback: Measures that people see after a trial.
+        force_limit_n: For each participant who needs a lower limit, by pseudonym, the largest
+            force with which the participant can push the arm, in N.
+        catch: Trials of another condition within a block. They do not count.
+        training: Trials in which authority moves from an expert to a learner.
+        staircase: Pairs of trials that adapt a scenario key to a participant's threshold.
+    """
+
+    name: Name
+    scenario: str
+    conditions: dict[Name, dict[str, Any]]
+    set: dict[str, Any] = field(default_factory=dict)
+    title: str = ""
+    users: tuple[str, ...] = ("m1",)
+    participants: Count | tuple[Pseudonym, ...] = 12
+    design: Literal["williams", "latin", "random", "fixed"] = "williams"
+    trials: Count = 10
+    practice: Counted = 0
+    foreperiod_s: tuple[Wait, Wait] = (0.5, 1.0)
+    seed: Annotated[int, Meta(ge=0, lt=2**31)] = 1
+    task: AnyTask = field(default_factory=ReachTrial)
+    model: ParticipantModel = field(default_factory=ParticipantModel)
+    consent: Annotated[str, Meta(max_length=20_000)] = ""
+    questionnaires: tuple[Questionnaire, ...] = ()
+    rest_s: Annotated[float, Meta(ge=0.0, le=3600.0)] = 0.0
+    feedback: tuple[Feedback, ...] = ()
+    force_limit_n: dict[Pseudonym, Positive] = field(default_factory=dict)
+    catch: _CatchTrials | None = None
+    training: _Training | None = None
+    staircase: Staircase | None = None
+
+    def list_phases(
+        self, condition: str, random: np.random.Generator
+    ) -> list[tuple[str, float | None]]:
+        """Lists the phase and the authority of each trial of a block, without practice trials.
+
+        A block contains all trials of a participant under one condition. In an experiment with
+        a training, the phases are "before", "training", "after" and "retention". In an
+        experiment with a staircase, trials come in pairs, and one of the two phases of a pair
+        is the standard trial.
+
+        Args:
+            condition: Name of the condition of the block.
+            random: Generator that draws the order within the pairs of a staircase.
+
+        Returns:
+            For each trial, the phase and the first user's part of the authority over the slave
+            arm, from 0 to 1. The phase is empty without training and staircase. A part of None
+            keeps the authority that the scenario defines.
+        """
+        phases: list[tuple[str, float | None]] = []
+        if self.staircase is not None:
+            for _ in range(self.trials // 2):
+                pair = random.permutation([STANDARD, COMPARISON]).tolist()
+                phases += [(phase, None) for phase in pair]
+            return phases
+        training = self.training
+        if training is None:
+            phases += [("", None)] * self.trials
+            return phases
+        first_lead, last_lead = training.lead[condition]
+        phases += [("before", 0.0)] * training.before
+        leads = np.linspace(first_lead, last_lead, self.trials).tolist()
+        phases += [("training", lead) for lead in leads]
+        phases += [("after", 0.0)] * training.after
+        phases += [("retention", 0.0)] * training.retention
+        return phases
+
+    @property
+    def forms(self) -> list[Questionnaire]:
+        """Forms that participants fill in during the experiment.
+
+        These are the questionnaires. In an experiment that measures a perception threshold, the
+        question that follows each pair of trials is a form too.
+        """
+        forms = list(self.questionnaires)
+        if self.staircase:
+            forms.append(self.staircase.form)
+        return forms
+
+    @property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Participants who take part together, as tuples of one or two pseudonyms."""
+        participants = self.participants
+        if isinstance(participants, int):
+            digits = len(str(participants))
+            numbers = range(1, participants + 1)
+            names = tuple(f"P{number:0{digits}d}" for number in numbers)
+        else:
+            names = participants
+        size = len(self.users)
+        groups: list[tuple[str, ...]] = []
+        for first in range(0, len(names), size):
+            group = names[first : first + size]
+            groups.append(group)
+        return groups
+
+
+class PlannedTrial(NamedTuple):
+    """One trial of an experiment, with its participants, condition and place in the order.
+
+    Attributes:
+        number: Number of the trial in the experiment, from 1.
+        group: Pseudonyms of the participants, in the order of the protocol's users.
+        condition: Name of the condition.
+        block: Number of the block within the group, from 1.
+        trial: Number of the trial within the block, from 1. Practice trials are first.
+        practice: True for a practice trial, which does not count.
+        before: Number of earlier trials of the group.
+        target: Number of the target. The first target of each block is drawn, so that effects
+            of the target's direction are not mistaken for learning. Both trials of a staircase
+            pair have the same target.
+        seed: Seed of the random numbers of the trial.
+        catch: True for a catch trial, which has another condition than its block and does not
+            count.
+        phase: Phase of a training: "before", "training", "after" or "retention". In a
+            staircase: "standard" or "comparison". Otherwise empty.
+        lead: The first user's part of the authority that two users have over the slave. None
+            keeps the scenario's dominance factors.
+    """
+
+    number: int
+    group: tuple[str, ...]
+    condition: str
+    block: int
+    trial: int
+    practice: bool
+    before: int
+    target: int
+    seed: int
+    catch: bool = False
+    phase: str = ""
+    lead: float | None = None
+
+    @property
+    def file(self) -> str:
+        """File name of the trial's log."""
+        group = "-".join(self.group)
+        position = f"b{self.block}-t{self.trial:02d}"
+        return f"{self.number:05d}-{group}-{position}-{self.condition}.mcap"
+
+
+Choices = Mapping[int, float]
+"""Chosen trial, 1 or 2, of each staircase pair, by the number of the pair's second trial."""
+
+
+class Step(NamedTuple):
+    """One thing that participants have to do in an experiment.
+
+    It is to give consent, to do a trial, or to answer a questionnaire.
+
+    Attributes:
+        kind: "consent", "trial" or "questionnaire".
+        planned: The trial of the step. For a consent this is the next trial, for a
+            questionnaire the previous one.
+        form: The questionnaire. None for other kinds.
+    """
+
+    kind: Literal["consent", "trial", "questionnaire"]
+    planned: PlannedTrial
+    form: Questionnaire | None = None
+
+    @property
+    def key(self) -> str:
+        """Identifier of the step, with which notes and messages refer to it."""
+        key = f"{self.kind} {self.planned.number}"
+        if self.form is not None:
+            return f"{key} {self.form.name}"
+        return key
+
+
+@dataclass(frozen=True, repr=False)
+class ExperimentPlan(Result):
+    """An experiment that is ready to run: its protocol and all trials in their order.
+
+    `plan_experiment` creates this object from a protocol.
+
+    Attributes:
+        protocol: Design of the experiment: conditions, task and participants.
+        scenarios: Scenario of each condition, by name.
+        trials: All trials in their order.
+        digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
+    """
+
+    protocol: Protocol
+    scenarios: Mapping[str, Scenario]
+    trials: Sequence[PlannedTrial]
+    digest: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Summarises the plan, as `trilat experiment check --json` prints it.
+
+        Returns:
+            Plain values, ready for JSON.
+        """
+        protocol = self.protocol
+        uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
+        return {
+            "name": protocol.name,
+            "digest": self.digest,
+            "groups": len(protocol.groups),
+            "trials": len(self.trials),
+            "counted": len(self.trials) - len(uncounted),
+            "conditions": list(protocol.conditions),
+            "orders": self.list_orders(),
+        }
+
+    def list_steps(self) -> Iterator[Step]:
+        """Yields everything that participants have to do, in the order of the experiment.
+
+        A group of participants does one block of trials for each condition. Its steps are:
+
+        - the consent, before its first trial;
+        - all trials;
+        - in an experiment with a staircase, the choice between the two trials of a pair, after
+          each pair. Practice trials form no pairs;
+        - questionnaires: after every block, or only after the last block of the group.
+
+        Yields:
+            The steps of all groups, one group after the other.
+        """
+        protocol = self.protocol
+        trials_per_block = self.trials[-1].trial
+        for planned in self.trials:
+            is_first_of_group = planned.block == planned.trial == 1
+            if protocol.consent and is_first_of_group:
+                yield Step("consent", planned)
+            yield Step("trial", planned)
+
+            trial_after_practice = planned.trial - protocol.practice
+            ends_pair = trial_after_practice > 0 and trial_after_practice % 2 == 0
+            if protocol.staircase is not None and ends_pair:
+                yield Step("questionnaire", planned, protocol.staircase.form)
+
+            ends_block = planned.trial == trials_per_block
+            if ends_block:
+                ends_experiment = planned.block == len(protocol.conditions)
+                for questionnaire in protocol.questionnaires:
+                    if ends_experiment or questionnaire.after == "block":
+                        yield Step("questionnaire", planned, find_form(questionnaire))
+
+    def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
+        """Judges which answers of the participants in a perception test were right.
+
+        In each pair of trials, a quantity such as the delay has its standard value in one
+        trial, and a larger value in the comparison trial. After the pair, the participants
+        choose one of the two trials. The choice of the comparison trial is right.
+
+        Args:
+            planned: Any trial of the block, which contains all trials of the participants under
+                one condition.
+            choices: The choices 1 (first trial) or 2 (second trial), by the number of the
+                second trial of the pair.
+
+        Returns:
+            For each choice in the block, in the order of the trials, True if it is right.
+        """
+        # Both numbers count from 1, so that the difference is the index of the first trial.
+        block_start = planned.number - planned.trial
+        trials_per_block = self.trials[-1].trial  # all blocks are equally long
+        block_end = block_start + trials_per_block
+        judgements: list[bool] = []
+        for trial in self.trials[block_start:block_end]:
+            is_second_of_judged_pair = trial.number in choices
+            if is_second_of_judged_pair:
+                comparison_is_second = trial.phase == COMPARISON
+                right_choice = 2 if comparison_is_second else 1
+                judgements.append(choices[trial.number] == right_choice)
+        return judgements
+
+    def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
+        """Returns what is known about the pair of trials to which a trial belongs.
+
+        A staircase presents pairs of trials that differ in one key, and the participant chooses
+        the trial in which the value was larger.
+
+        Args:
+            planned: A trial of the pair.
+            choices: Choices of the participants.
+
+        Returns:
+            The difference between both trials, in the unit of the staircase's key; and True if
+            the participant's choice was right, False if it was wrong, None before the choice.
+        """
+        staircase = self.protocol.staircase
+        assert staircase is not None
+        index_in_block = planned.trial - self.protocol.practice - 1
+        pair = index_in_block // 2
+        judgements = self.judge_choices(planned, choices)
+        differences = staircase.list_differences(judgements)
+        is_right = None
+        if pair < len(judgements):
+            is_right = judgements[pair]
+        return differences[pair], is_right
+
+    def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
+        """Returns the scenario of a trial.
+
+        It is the scenario of the trial's condition. In a staircase, a key of it is adapted to
+        the earlier choices of the participant.
+
+        Args:
+            planned: The trial in the plan.
+            choices: Choices that participants have made so far.
+        """
+        scenario = self.scenarios[planned.condition]
+        staircase = self.protocol.staircase
+        if staircase is None or planned.practice:
+            return scenario
+        difference = 0.0
+        if planned.phase == COMPARISON:
+            difference, _ = self.find_pair(planned, choices)
+        value = staircase.standard + difference
+        return load_scenario(scenario, {staircase.key: value})
+
+    def rest_before_s(self, planned: PlannedTrial) -> float:
+        """Returns how long participants must at least rest before a trial, in s.
+
+        Args:
+            planned: The trial in the plan.
+        """
+        training = self.protocol.training
+        previous = self.trials[max(planned.number - 2, 0)]
+        starts_retention = planned.phase == "retention" and previous.phase != "retention"
+        if training is not None and starts_retention:
+            return training.rest_s
+        starts_later_block = planned.trial == 1 and planned.block > 1
+        if starts_later_block:
+            return self.protocol.rest_s
+        return 0.0
+
+    def list_orders(self) -> dict[str, list[str]]:
+        """Returns the order in which each group of participants gets the conditions.
+
+        Returns:
+            Names of the conditions in order, by the name of the group.
+        """
+        orders: dict[str, list[str]] = {}
+        for trial in self.trials:
+            if trial.catch:
+                continue
+            group = "-".join(trial.group)
+            order = orders.setdefault(group, [])
+            if trial.condition not in order:
+                order.append(trial.condition)
+        return orders
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat experiment check` prints."""
+        protocol = self.protocol
+        facts = self.to_dict()
+        unit = "pair" if len(protocol.users) > 1 else "participant"
+        units = count_nouns(facts["groups"], unit)
+        users = ", ".join(protocol.users)
+        yield f"{protocol.name}: {protocol.title or protocol.task.description}"
+        yield f"{units} at {users}, {protocol.task.description}"
+        conditions = count_nouns(len(protocol.conditions), "condition")
+        block_size = self.trials[-1].trial
+        counted = count_nouns(block_size - protocol.practice, "trial")
+        total = count_nouns(len(self.trials), "trial")
+        _, longest_foreperiod_s = protocol.foreperiod_s
+        longest_s = longest_foreperiod_s + protocol.task.longest_s
+        yield (
+            f"{conditions} of {protocol.practice} + {counted}: "
+            f"{total} of at most {longest_s:g} s; design {protocol.design}"
+        )
+        rows = [(name, ", ".join(order)) for name, order in facts["orders"].items()]
+        yield TextTable(("", "order of conditions"), rows)
+        yield f"sha256 of the plan {self.digest}"
+
+
+def read_protocol(file: str | Path) -> Protocol:
+    """Reads the protocol of an experiment from a TOML file, without planning its trials.
+
+    Args:
+        file: Path of the file.
+
+    Raises:
+        UsageError: The file cannot be read, or a key or value in it is not valid.
+    """
+    path = Path(file)
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        return msgspec.convert(tables, Protocol)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: is not valid TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        valid = ", ".join(key.encode_name for key in msgspec.structs.fields(Protocol))
+        raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
+
+
+def plan_experiment(
+    protocol: Protocol,
+    folder: Path | None = None,
+    scenarios: Mapping[str, Scenario] | None = None,
+) -> ExperimentPlan:
+    """Plans the trials of a protocol.
+
+    Args:
+        protocol: Design of the experiment: conditions, task and participants.
+        folder: Folder to which the path of the protocol's scenario is relative.
+        scenarios: Scenario of each condition. None loads them from the protocol's scenario.
+
+    Raises:
+        UsageError: The protocol cannot be carried out. The error lists all problems.
+    """
+    problems = list(_find_problems(protocol))
+    condition_scenarios: dict[str, Scenario] = {}
+    if scenarios is not None:
+        condition_scenarios |= scenarios
+    else:
+        source: str | Path = protocol.scenario
+        if folder is not None and (folder / protocol.scenario).is_file():
+            source = folder / protocol.scenario
+        for name, keys in protocol.conditions.items():
+            settings = _list_keys(protocol.set) | _list_keys(keys)
+            try:
+                scenario = load_scenario(source, settings)
+                condition_scenarios[name] = _check_scenario(scenario, protocol)
+            except TrilatError as error:
+                problems.append(f"condition {name}: {error}")
+    if problems:
+        raise UsageError(f"{protocol.name}: " + "; ".join(problems))
+    texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
+    tables = msgspec.to_builtins(protocol)
+    content = msgspec.json.encode([tables, texts], order="sorted")
+    return ExperimentPlan(
+        protocol=protocol,
+        scenarios=condition_scenarios,
+        trials=list(_list_trials(protocol)),
+        digest=hashlib.sha256(content).hexdigest(),
+    )
+
+
+def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Returns the dotted keys of a table of scenario settings with their values.
+
+    Tables of sites, links and dominance factors are expanded. Other tables stay values.
+
+    Args:
+        table: The table.
+        path: Dotted key of the table. Empty for the top level.
+    """
+    keys = dict[str, Any]()
+    for name, value in table.items():
+        key = f"{path}.{name}" if path else name
+        has_members = key in ("sites", "links", "dominance")
+        is_member = path in ("sites", "links")
+        if isinstance(value, Mapping) and (has_members or is_member):
+            keys |= _list_keys(value, key)
+        else:
+            keys[key] = value
+    return keys
+
+
+def _find_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems of a protocol that are visible without its scenario."""
+    shortest_s, longest_s = protocol.foreperiod_s
+    if shortest_s > longest_s:
+        foreperiod_s = list(protocol.foreperiod_s)
+        yield f"foreperiod_s must go from the shorter to the longer time, not {foreperiod_s}"
+    yield from _find_pseudonym_problems(protocol)
+    yield from _find_table_problems(protocol)
+    yield from _find_form_problems(protocol)
+    yield from _find_group_problems(protocol)
+
+
+def _list_pseudonyms(protocol: Protocol) -> list[str]:
+    """Returns the pseudonyms of all participants."""
+    return [name for group in protocol.groups for name in group]
+
+
+def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with the pseudonyms of participants."""
+    names = _list_pseudonyms(protocol)
+    if len(set(names)) < len(names):
+        yield "two participants have the same pseudonym"
+    unknown = protocol.force_limit_n.keys() - set(names)
+    if unknown:
+        yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
+
+
+def _find_table_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with catch trials, a training, or a staircase."""
+    catch = protocol.catch
+    training = protocol.training
+    staircase = protocol.staircase
+    if catch is not None and catch.condition not in protocol.conditions:
+        yield f"catch.condition: there is no condition {catch.condition}"
+    if training is not None and training.lead.keys() != protocol.conditions.keys():
+        conditions = ", ".join(protocol.conditions)
+        yield f"training.lead: must have a pair of numbers for each of {conditions}"
+    tables = [table for table in (training, catch, staircase) if table is not None]
+    if len(tables) > 1:
+        yield "catch trials, a training and a staircase exclude each other"
+    if staircase is not None:
+        yield from _find_staircase_problems(protocol, staircase)
+    needs_pair = training is not None or protocol.task.needs_pair
+    if needs_pair and len(protocol.users) != 2:
+        yield "a training, a handover and a task with two targets need two users"
+
+
+def _find_form_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with the questionnaires."""
+    names = [form.name for form in protocol.forms]
+    if len(set(names)) < len(names):
+        yield "two questionnaires have the same name"
+    for form in protocol.questionnaires:
+        try:
+            find_form(form)
+        except UsageError as error:
+            yield str(error)
+
+
+def _find_group_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields the problems with the users and the number of participants.
+
+    Some designs balance the orders of conditions only if the number of groups is a multiple of
+    the number of orders.
+    """
+    users = protocol.users
+    name_count = len(_list_pseudonyms(protocol))
+    if not 1 <= len(users) <= 2 or len(set(users)) < len(users):
+        yield f"users must be one or two sites, not {', '.join(users)}"
+    elif name_count % len(users):
+        participants = count_nouns(name_count, "participant")
+        yield f"{participants} cannot form pairs: the number of participants must be even"
+    orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    group_count = len(protocol.groups)
+    if protocol.design in ("williams", "latin") and group_count % len(orders):
+        units = "pairs" if len(users) == 2 else "participants"
+        conditions = count_nouns(len(protocol.conditions), "condition")
+        yield (
+            f"a {protocol.design} design of {conditions} has "
+            f"{count_nouns(len(orders), 'order')}: the number of {units} must be a multiple of "
+            f"{len(orders)}, not {group_count}"
+        )
+
+
+def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterator[str]:
+    """Yields the problems of a protocol with a staircase."""
+    if len(protocol.users) != 1:
+        yield "staircase: needs exactly one user, who answers after each pair of trials"
+    if protocol.trials % 2:
+        yield (
+            "trials: a staircase consists of pairs of trials: the number of trials must be "
+            f"even, not {protocol.trials}"
+        )
+    key = staircase.key
+    conditions = [name for name, keys in protocol.conditions.items() if key in _list_keys(keys)]
+    if conditions:
+        yield f"staircase.key: {key} must not be set by condition {', '.join(conditions)} too"
+
+
+def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
+    """Returns the scenario of a condition if the experiment can be run with it.
+
+    Raises:
+        ScenarioError: A user's site is missing or cannot be held by a person, or a wall, a
+            dominance factor, a force limit or a key of the staircase does not fit.
+    """
+    for user in protocol.users:
+        if user not in scenario.names:
+            raise ScenarioError(
+                f"the scenario has no site {user}; its sites are {', '.join(scenario.names)}",
+                path="users",
+            )
+        if scenario.sites[user].find_live_hand(is_open=True) is None:
+            raise ScenarioError(
+                "has no live hand, so nobody can hold this arm; "
+                "add hands = [{ kind = 'live' }]",
+                path=f"sites.{user}.hands",
+            )
+    slave = scenario.slave
+    if protocol.task.needs_wall and not scenario.sites[slave].environment:
+        raise ScenarioError(
+            "the slave has no wall to press against", path=f"sites.{slave}.environment"
+        )
+    shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
+    needs_shares = protocol.training is not None or protocol.task.needs_pair
+    if needs_shares and min(shares) <= 0.0:
+        raise ScenarioError("both users must have a share above 0", path=f"dominance.{slave}")
+    for group in protocol.groups:
+        limit_forces(scenario, protocol, group)
+    staircase = protocol.staircase
+    if staircase is not None:
+        largest = staircase.standard + staircase.start
+        for value in (staircase.standard, largest):
+            load_scenario(scenario, {staircase.key: value})
+    return scenario
+
+
+def limit_forces(
+    scenario: Scenario, protocol: Protocol, group: Sequence[str]
+) -> dict[str, Any]:
+    """Returns sites with lower force limits, for participants who must not push hard.
+
+    The protocol states these participants and their limits under `force_limit_n`.
+
+    Args:
+        scenario: Scenario of the condition.
+        protocol: Design of the experiment: conditions, task and participants.
+        group: Pseudonyms of the participants.
+
+    Returns:
+        The specifications of the sites whose limits change, by the name of the site. Empty if
+        no participant of the group needs a lower limit.
+
+    Raises:
+        ScenarioError: The scenario has no force limit for this site, or has a lower limit
+            already.
+    """
+    limited_sites: dict[str, Any] = {}
+    # The lengths may differ: `_find_problems` reports a group that is too small.
+    for user, name in zip(protocol.users, group, strict=False):
+        spec = scenario.sites[user]
+        limit_n = protocol.force_limit_n.get(name)
+        live_hand = spec.find_live_hand(is_open=True)
+        if limit_n is None or live_hand is None:
+            continue
+        key = f"force_limit_n.{name}"
+        if live_hand.mode == "joint":
+            raise ScenarioError(
+                f"the live hand at {user} has the mode 'joint' and therefore no limit in N",
+                path=key,
+            )
+        hand_limit_n = live_hand.force_limit_n
+        if hand_limit_n < limit_n:
+            raise ScenarioError(
+                f"{limit_n:g} N exceeds the limit of the live hand at {user}, "
+                f"which is {hand_limit_n:g} N",
+                path=key,
+            )
+        limited_hand = replace(live_hand, force_limit_n=limit_n)
+        hands = tuple(limited_hand if hand is live_hand else hand for hand in spec.hands)
+        limited_sites[user] = replace(spec, hands=hands)
+    return limited_sites
+
+
+def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
+    """Lists the orders of conditions, which are assigned to participants in turn.
+
+    Args:
+        design: "williams": each condition is equally often at each position, and equally often
+            right after each other condition (Williams 1949); an odd number of conditions needs
+            twice as many orders. "latin": a cyclic Latin square, which balances only the
+            positions. "random": 1000 random permutations. "fixed": the order of `conditions`.
+        conditions: Names of the conditions.
+        seed: Seed of random permutations.
+    """
+    count = len(conditions)
+    if design == "fixed":
+        return [tuple(conditions)]
+    if design == "random":
+        random = np.random.default_rng(seed)
+        names = np.array(conditions)
+        orders: list[tuple[str, ...]] = []
+        for _ in range(1000):
+            order = names[random.permutation(count)]
+            orders.append(tuple(order.tolist()))
+        return orders
+    first_row = list(range(count))
+    if design == "williams":
+        # The first row is 0, 1, n - 1, 2, n - 2, ...
+        first_row = [0]
+        for step in range(1, count // 2 + 1):
+            first_row += [step, count - step]
+        first_row = first_row[:count]
+    rows = [[(index + shift) % count for index in first_row] for shift in range(count)]
+    # For an odd number, only the rows and their mirror images together are balanced.
+    if design == "williams" and count % 2:
+        rows += [row[::-1] for row in rows]
+    return [tuple(conditions[index] for index in row) for row in rows]
+
+
+def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
+    """Yields all trials of an experiment in their order.
+
+    Each group of participants does one block of trials per condition. The order of the
+    conditions is the next one of `list_orders`. A block begins with practice trials. The
+    further trials are those of `Protocol.list_phases`: a trial has a phase (of a training or of
+    a staircase, otherwise empty), and a lead, the first user's part of the authority over the
+    slave arm. Catch trials have another condition than their block. Numbers count from 1, and
+    indices from 0.
+
+    Each random quantity has a generator of its own, whose seed contains the seed of the
+    protocol, the group and the block. A last number distinguishes the quantities: none for the
+    first target, 1 for catch trials, and 2 for phases. Therefore a change of one quantity does
+    not change the others.
+
+    Args:
+        protocol: Design of the experiment: conditions, task and participants.
+    """
+    orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    groups = list(enumerate(protocol.groups))
+    blocks = range(len(protocol.conditions))
+    number = 0
+    for (group_index, group), block in itertools.product(groups, blocks):
+        condition = orders[group_index % len(orders)][block]
+        phase_random = np.random.default_rng([protocol.seed, group_index, block, 2])
+        phases: list[tuple[str, float | None]] = [("", None)] * protocol.practice
+        phases += protocol.list_phases(condition, phase_random)
+        catch_trials = _draw_catches(protocol, condition, group_index, block)
+        target_random = np.random.default_rng([protocol.seed, group_index, block])
+        # A task has fewer targets than this. It takes the number modulo that of its targets.
+        first_target = int(target_random.integers(1000))
+        for trial, (phase, lead) in enumerate(phases):
+            number += 1
+            is_catch = trial in catch_trials
+            trial_condition = condition
+            if protocol.catch is not None and is_catch:
+                trial_condition = protocol.catch.condition
+            seed_sequence = np.random.SeedSequence([protocol.seed, number])
+            state = seed_sequence.generate_state(1)
+            target_step = trial
+            if protocol.staircase:
+                # Both trials of a pair have the same target.
+                target_step = (trial - protocol.practice) // 2
+            yield PlannedTrial(
+                number=number,
+                group=group,
+                condition=trial_condition,
+                block=block + 1,
+                trial=trial + 1,
+                practice=trial < protocol.practice,
+                before=block * len(phases) + trial,
+                target=first_target + target_step,
+                # 31 bits, so that the seed is a positive 32-bit integer.
+                seed=int(state[0]) >> 1,
+                catch=is_catch,
+                phase=phase,
+                lead=lead,
+            )
+
+
+def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) -> set[int]:
+    """Draws which trials of a block are catch trials.
+
+    Args:
+        protocol: Design of the experiment: conditions, task and participants.
+        condition: Condition of the block.
+        group: Index of the group.
+        block: Index of the block.
+
+    Returns:
+        Indices of the catch trials in the block, from 0 with practice trials included.
+    """
+    catch = protocol.catch
+    if catch is None or catch.condition == condition:
+        return set()
+    random = np.random.default_rng([protocol.seed, group, block, 1])
+    count = round(catch.share * protocol.trials)
+    drawn = random.permutation(protocol.trials)[:count]
+    indices = protocol.practice + drawn
+    return set(indices.tolist())

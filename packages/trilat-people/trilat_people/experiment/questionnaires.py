@@ -1,0 +1,161 @@
+"""Defines questionnaires that people answer on the page of an experiment.
+
+NASA-TLX (workload), SUS (usability) and a questionnaire on the sense of agency ship with
+trilat-net. A protocol may define others.
+
+Invariant:
+    - An answer is a number of the questionnaire's scale, or None. Anything else is refused.
+    - None stands for an item without an answer, such as a slider that nobody touched. It is
+      stored and counted as missing.
+    - A questionnaire with a missing answer has no score.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import resources
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, field
+from msgspec.structs import replace
+
+from trilat_net.errors import UsageError, count_nouns
+from trilat_net.fields import Frozen
+
+from .movement_measures import raw_tlx, sus_score
+
+Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+Text = Annotated[str, Meta(max_length=300)]
+
+CHOICE = "choice"
+"""Name of the form after a pair of trials of a staircase, which must be answered."""
+Answers = Mapping[str, float | None]
+"""Answers by item. None for a missing answer."""
+
+
+class Questionnaire(Frozen, frozen=True):
+    """A questionnaire of a protocol. A shipped questionnaire needs only its name.
+
+    Attributes:
+        name: Name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
+        after: "block" if people answer after each block, "experiment" if they answer once after
+            the last block.
+        title: Heading of the form.
+        items: Texts of the rated items, by their names in the table.
+        low: Text at the lower end of the scale.
+        high: Text at the upper end of the scale.
+        ends: For items that differ, the texts at both ends.
+        least: Smallest number of the scale.
+        most: Largest number of the scale.
+        step: Distance between two numbers of the scale.
+    """
+
+    name: Name
+    after: Literal["block", "experiment"] = "block"
+    title: Text = ""
+    items: Annotated[dict[Name, Text], Meta(max_length=40)] = field(default_factory=dict)
+    low: Text = ""
+    high: Text = ""
+    ends: dict[Name, tuple[Text, Text]] = field(default_factory=dict)
+    least: int = 1
+    most: int = 7
+    step: Annotated[int, Meta(ge=1)] = 1
+
+    @property
+    def is_forced(self) -> bool:
+        """True if every item must be answered."""
+        return self.name == CHOICE
+
+    def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
+        """Checks the answers that a page sent, and assigns them to the items.
+
+        Args:
+            values: Answers in the order of the items. None for a missing answer.
+
+        Returns:
+            The answers by the names of the items. None for a missing answer.
+
+        Raises:
+            UsageError: There are more or fewer values than items, a value is not on the scale,
+                or a required answer is missing.
+        """
+        are_valid = all(self._is_valid(value) for value in values)
+        if len(values) != len(self.items) or not are_valid:
+            count = count_nouns(len(self.items), "answer")
+            raise UsageError(
+                f"{self.name}: give {count} between {self.least} and {self.most}, "
+                f"in steps of {self.step}"
+            )
+        return dict(zip(self.items, values, strict=True))
+
+    def _is_valid(self, value: float | None) -> bool:
+        """Returns True if a value is on the scale, or is a missing answer that is allowed."""
+        if value is None:
+            return not self.is_forced
+        return value in range(self.least, self.most + 1, self.step)
+
+    def score(self, answers: Answers) -> float | None:
+        """Computes the score of a completed questionnaire.
+
+        Args:
+            answers: The answers by item.
+
+        Returns:
+            The raw NASA Task Load Index for `tlx`, the score of the System Usability Scale for
+            `sus`, and the mean of the answers for any other questionnaire. None if an answer is
+            missing.
+        """
+        complete = {item: value for item, value in answers.items() if value is not None}
+        if len(complete) < len(answers):
+            return None
+        if self.name == "tlx":
+            return raw_tlx(complete)
+        if self.name == "sus":
+            return sus_score([int(value) for value in complete.values()])
+        return float(np.mean(list(complete.values())))
+
+
+@cache
+def _read_shipped() -> dict[str, Any]:
+    """Returns the shipped questionnaires as tables, by name."""
+    source = resources.files(__package__) / "questionnaires.txt"
+    tables: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
+    return tables
+
+
+def find_form(questionnaire: Questionnaire) -> Questionnaire:
+    """Returns a questionnaire with its items filled in.
+
+    A protocol names a shipped questionnaire without stating its items.
+
+    Args:
+        questionnaire: The questionnaire as the protocol states it.
+
+    Raises:
+        UsageError: The questionnaire has no items and no shipped one has its name, or its scale
+            does not have 2 to 101 numbers.
+    """
+    name = questionnaire.name
+    shipped = _read_shipped()
+    if not questionnaire.items:
+        if name not in shipped:
+            raise UsageError(
+                f"questionnaire {name} has no items; "
+                f"the built-in questionnaires are {', '.join(shipped)}"
+            )
+        form = msgspec.convert({"name": name, **shipped[name]}, Questionnaire)
+        return replace(form, after=questionnaire.after)
+    if name in shipped:
+        raise UsageError(
+            f"questionnaire {name} is built in and has its own items; "
+            "give your questionnaire another name"
+        )
+    length = questionnaire.most - questionnaire.least
+    if not questionnaire.step <= length <= 100 * questionnaire.step:
+        raise UsageError(
+            f"questionnaire {name}: the scale must have 2 to 101 numbers; "
+            "correct least, most or step"
+        )
+    return questionnaire

@@ -1,0 +1,185 @@
+"""Finds the smallest difference that a participant perceives, with an adaptive staircase.
+
+A staircase consists of pairs of trials. In one trial of a pair, a key of the scenario has its
+standard value, in the other a larger value. The order of the two is drawn. After each pair, the
+participant says in which trial the value was larger. After `down` right answers in a row the
+difference is divided by `factor`, and after a wrong answer it is multiplied by `factor`
+(Levitt, 1971). The difference settles where steps down and up are equally likely. There the
+probability of a right answer is 0.5^(1 / down), for example 0.707 for `down` = 2.
+
+Invariant:
+    - The differences in a block follow from the protocol and from the earlier answers of the
+      block.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from trilat_net.fields import Frozen, Positive
+
+from .questionnaires import CHOICE, Questionnaire, Text
+
+STANDARD = "standard"
+"""Phase of a trial with the standard value."""
+COMPARISON = "comparison"
+"""Phase of a trial with the larger value."""
+SKIPPED_REVERSALS = 2
+"""Number of reversals before the difference is near its final value."""
+
+
+class Staircase(Frozen, frozen=True):
+    """Settings of a perception test that finds the smallest difference a participant notices.
+
+    Trials come in pairs. A scenario key, such as the delay, has its standard value in one trial
+    of a pair, and a larger value in the other. The participant says in which trial the value
+    was larger. The difference of the two values decreases after right answers, and increases
+    after wrong answers.
+
+    Attributes:
+        key: The scenario key that is varied.
+        start: First difference, which is also the largest, in the key's unit.
+        standard: Value of the key in the standard trial, in the key's unit.
+        factor: Factor by which the difference changes.
+        down: Number of right answers in a row after which the difference decreases.
+        asks: Question that participants answer after each pair.
+        deviation: Standard deviation of the perception of a simulated participant, in the key's
+            unit. None stands for a quarter of `start`.
+    """
+
+    key: str
+    start: Positive
+    standard: float = 0.0
+    factor: Annotated[float, Meta(gt=1.0, le=10.0)] = 1.5
+    down: Annotated[int, Meta(ge=1, le=5)] = 2
+    asks: Text = "In which of the last two trials was it stronger?"
+    deviation: Positive | None = None
+
+    @property
+    def measure(self) -> str:
+        """Name of the measured perception threshold, with its unit.
+
+        It is "threshold_" and the last part of the scenario key that is varied. For example,
+        the key `link.delay_ms` gives threshold_delay_ms.
+        """
+        parts = [part for part in self.key.split(".") if not part.isdigit()]
+        return f"threshold_{parts[-1]}"
+
+    @property
+    def form(self) -> Questionnaire:
+        """Questionnaire that participants answer after each pair of trials.
+
+        The answer is 1 or 2, the trial of the pair in which the value seemed larger.
+        """
+        return Questionnaire(
+            name=CHOICE,
+            title="Which one?",
+            items={CHOICE: self.asks},
+            low="the first",
+            high="the second",
+            most=2,
+        )
+
+    def _list_directions(self, right: Sequence[bool]) -> list[int]:
+        """Returns the direction in which the difference changes after each answer.
+
+        Args:
+            right: For each answer, True if it was right.
+
+        Returns:
+            For each answer -1 for down, 1 for up, or 0 for no change.
+        """
+        directions: list[int] = []
+        right_in_row = 0
+        for is_right in right:
+            if not is_right:
+                right_in_row = 0
+                directions.append(1)
+                continue
+            right_in_row += 1
+            is_row_complete = right_in_row % self.down == 0
+            directions.append(-1 if is_row_complete else 0)
+        return directions
+
+    def list_differences(self, right: Sequence[bool]) -> list[float]:
+        """Lists the differences that a participant has compared, and the next difference.
+
+        In each pair of trials, a scenario key has its standard value in one trial, and a value
+        that is larger by the difference in the other. The difference decreases after `down`
+        right answers in a row, and increases after a wrong answer, up to its start value.
+
+        Args:
+            right: For each answered pair in order, True if the answer was right.
+
+        Returns:
+            The differences in the key's unit, one for each answered pair and one for the next
+            pair.
+        """
+        differences = [self.start]
+        for direction in self._list_directions(right):
+            difference = differences[-1] * self.factor**direction
+            differences.append(min(difference, self.start))
+        return differences
+
+    def find_threshold(self, right: Sequence[bool]) -> float | None:
+        """Computes the threshold, the geometric mean of the differences at the reversals.
+
+        A reversal is a step in another direction than the previous step. The first two
+        reversals do not count, because the difference is still far from its final value. If the
+        number of reversals is odd, the third does not count either, so that as many reversals
+        lead up as down.
+
+        Args:
+            right: For each answer, True if it was right.
+
+        Returns:
+            The threshold in the key's unit. None if no reversals are left.
+        """
+        # There is one difference more than directions: that of the next pair.
+        pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
+        steps = [(difference, direction) for difference, direction in pairs if direction]
+        reversals: list[float] = []
+        for (_, previous_direction), (difference, direction) in pairwise(steps):
+            if direction != previous_direction:
+                reversals.append(difference)
+        skipped_count = SKIPPED_REVERSALS + len(reversals) % 2
+        counted = reversals[skipped_count:]
+        if not counted:
+            return None
+        return float(np.exp(np.mean(np.log(counted))))
+
+    def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
+        """Draws which trial of a pair a synthetic participant chooses.
+
+        The participant perceives each trial with a normal error. Therefore the choice is right
+        with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
+
+        Args:
+            difference: Difference within the pair, in the key's unit.
+            comparison: Number of the trial with the larger value, 1 or 2.
+            seed: Seed of the choice.
+
+        Returns:
+            Number of the chosen trial, 1 or 2.
+        """
+        deviation = self.deviation or self.start / 4.0
+        random = np.random.default_rng([seed, 2])
+        # The difference of two normal errors has sqrt(2) times their deviation.
+        error = 2.0**0.5 * deviation * random.standard_normal()
+        standard = 3 - comparison
+        return comparison if difference + error > 0.0 else standard
+
+    def describe(self) -> str:
+        """Describes in a sentence how the perception threshold was measured, for a paper."""
+        right_percent = 100.0 * 0.5 ** (1.0 / self.down)
+        return (
+            f"{self.key} was adapted in a two-interval forced choice against "
+            f"{self.standard:g}: from a difference of {self.start:g}, divided by "
+            f"{self.factor:g} after {self.down} right answers in a row and multiplied by it "
+            "after a wrong one (Levitt, 1971); a "
+            f"threshold, of {right_percent:.1f} % right answers, is the geometric mean of the "
+            f"differences at its reversals but the first {SKIPPED_REVERSALS}"
+        )

@@ -1,0 +1,880 @@
+"""Computes statistics of experiments with people: means, tests, power, and a methods paragraph.
+
+All functions read tidy rows: each trial is a mapping with `participant`, `pair`, `condition`
+and the measures by name, as in `trials.csv`. A trial whose value of a measure is None or ""
+does not count for that measure. A unit is what is sampled independently: a participant, or a
+pair whose members take part together.
+
+Invariant:
+    - Trials are averaged per unit and condition before any test, so that more trials do not
+      count as more participants.
+    - A measure that both users of a pair share is tested with `unit="pair"`.
+    - A statistic that the data do not determine is None.
+    - Equal rows and seeds give equal numbers.
+"""
+
+import math
+import re
+import warnings
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import UsageError, count_nouns
+from trilat_net.fields import split_unit
+from trilat_net.files import import_extra
+from trilat_net.work.intervals import mean_interval, wilson_interval
+
+Row = Mapping[str, Any]
+"""A trial: its participant, pair and condition, and its measures by name."""
+CONFIDENCE = 0.95
+"""Confidence level of all intervals."""
+RESAMPLES = 5000
+"""Number of resamples of the bootstrap."""
+_ROUNDING = 1e-12
+"""Spread relative to the largest value, below which values count as equal."""
+
+
+def import_scipy_stats() -> Any:
+    """Imports and returns the module `scipy.stats`, which only the statistics need."""
+    # The import takes half a second, and most commands do not need it.
+    from scipy import stats
+
+    return stats
+
+
+# --- means ------------------------------------------------------------------------------------
+
+
+def average_trials(
+    rows: Sequence[Row], measure: str, unit: str = "participant"
+) -> dict[str, dict[str, float]]:
+    """Averages a measure over the trials of each participant or pair under each condition.
+
+    The statistics are computed from these means, because trials of the same participant are not
+    independent.
+
+    Args:
+        rows: Trials, as mappings from column names to values.
+        measure: Name of the measure.
+        unit: Key of the independently sampled unit: "participant" or "pair".
+
+    Returns:
+        The means, by condition and then by the name of the participant or pair, in the order of
+        the rows.
+
+    Raises:
+        UsageError: No row has the measure, a row lacks a key, or a value is not a finite
+            number.
+    """
+    values: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        missing = [key for key in (unit, "condition") if key not in row]
+        if missing:
+            raise UsageError(
+                f"a row lacks {' and '.join(missing)}: "
+                f"every row must have the keys {unit} and condition"
+            )
+        values_by_unit = values.setdefault(str(row["condition"]), {})
+        value = row.get(measure)
+        if value not in (None, ""):
+            number = read_number(value, measure, row)
+            values_by_unit.setdefault(str(row[unit]), []).append(number)
+    means: dict[str, dict[str, float]] = {}
+    for condition, values_by_unit in values.items():
+        means[condition] = {
+            name: math.fsum(numbers) / len(numbers) for name, numbers in values_by_unit.items()
+        }
+    if not any(means.values()):
+        keys = {key for row in rows for key in row}
+        names = sorted(keys - {"participant", "pair", "condition"})
+        measures = ", ".join(names) or "no measures"
+        raise UsageError(f"no trial has a number for {measure}; the rows contain {measures}")
+    return means
+
+
+def read_number(value: Any, measure: str, row: Row) -> float:
+    """Returns the value of a measure in a row as a number.
+
+    Args:
+        value: A number, or its text from a CSV file.
+        measure: Name of the measure, for the error message.
+        row: The trial, for the error message.
+
+    Raises:
+        UsageError: The value is not a finite number.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        keys = ("participant", "condition", "trial")
+        trial = ", ".join(f"{key} {row[key]}" for key in keys if key in row)
+        raise UsageError(
+            f"{measure} = {value!r} ({trial}): give a finite number, or leave the value empty"
+        )
+    return number
+
+
+class ConditionMean(NamedTuple):
+    """Mean and spread of a measure under one condition, over participants or pairs.
+
+    A unit is what was sampled independently: a participant, or a pair whose members take part
+    together. The standard deviation and the intervals are None for fewer than two units.
+
+    Args:
+        condition: Name of the condition.
+        number: Number of units with at least one trial.
+        mean: Mean of the means of the units.
+        deviation: Standard deviation of the means of the units.
+        interval: 95 % confidence interval of the mean by Student's t.
+        bootstrap: 95 % confidence interval of the mean by the bias-corrected and accelerated
+            bootstrap (BCa).
+        missing: Number of trials, or questionnaires, without a number. They are not averaged.
+    """
+
+    condition: str
+    number: int
+    mean: float
+    deviation: float | None
+    interval: tuple[float, float] | None
+    bootstrap: tuple[float, float] | None
+    missing: int = 0
+
+
+def summarise_conditions(
+    rows: Sequence[Row], measure: str, *, unit: str = "participant", seed: int = 0
+) -> list[ConditionMean]:
+    """Returns the mean of a measure under each condition, with its spread and intervals.
+
+    The trials of each participant (or pair) are averaged first. Conditions in which no trial
+    has a number are left out.
+
+    Args:
+        rows: Trials as mappings from column names to values, as for `average_trials`.
+        measure: Name of the measure, which is a column.
+        unit: "participant" if participants are independent of each other. "pair" if the two
+            members of a pair did the trials together, and only pairs are independent.
+        seed: Seed of the bootstrap, a confidence interval that uses random samples.
+
+    Returns:
+        A summary per condition, in the order in which the conditions first occur.
+    """
+    means = average_trials(rows, measure, unit)
+    rows_without_value = [row for row in rows if row.get(measure) in (None, "")]
+    missing = Counter(str(row["condition"]) for row in rows_without_value)
+    summaries: list[ConditionMean] = []
+    for condition, means_by_unit in means.items():
+        if means_by_unit:
+            summary = _summarise(condition, list(means_by_unit.values()), seed)
+            summaries.append(summary._replace(missing=missing[condition]))
+    return summaries
+
+
+def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
+    """Returns mean, spread and intervals of the means of the units."""
+    mean = mean_interval(values)
+    if mean is None:
+        return ConditionMean(
+            condition=condition,
+            number=len(values),
+            mean=values[0],
+            deviation=None,
+            interval=None,
+            bootstrap=None,
+        )
+    return ConditionMean(
+        condition=condition,
+        number=len(values),
+        mean=mean.mean,
+        deviation=float(np.std(values, ddof=1)),
+        interval=(mean.mean - mean.half, mean.mean + mean.half),
+        bootstrap=bootstrap_interval(values, seed),
+    )
+
+
+def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
+    """Computes the 95 % confidence interval of a mean by the BCa bootstrap.
+
+    The bootstrap resamples the values with replacement, and needs no normal distribution. BCa
+    stands for its bias-corrected and accelerated form.
+
+    Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
+    82 (1987).
+
+    Args:
+        values: The values, one per participant or pair.
+        seed: Seed of the resampling.
+
+    Returns:
+        Lower and upper end. None for fewer than two values.
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    if sample.size < 2:
+        return None
+    # BCa divides by the spread of the sample, and returns NaN for equal values.
+    if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
+        mean = float(sample.mean())
+        return mean, mean
+    result = import_scipy_stats().bootstrap(
+        (sample,),
+        np.mean,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="BCa",
+        rng=np.random.default_rng(seed),
+    )
+    interval = result.confidence_interval
+    return float(interval.low), float(interval.high)
+
+
+# --- paired comparisons -----------------------------------------------------------------------
+
+
+class Comparison(NamedTuple):
+    """Comparison of a measure between two conditions, within units.
+
+    Interval, tests and effect sizes need two units. With fewer they are None.
+
+    Args:
+        measure: Name of the measure.
+        first: Name of the first condition.
+        second: Name of the second condition.
+        number: Number of units that have both conditions.
+        difference: Mean of second minus first.
+        interval: 95 % interval of the difference by Student's t.
+        t: Statistic of the paired test, with number - 1 degrees of freedom. None if all
+            differences are equal.
+        p: Two-sided p value of the paired test.
+        p_holm: p corrected for all comparisons of the measure.
+        d_z: Effect size: difference over the standard deviation of the differences.
+        d_av: Effect size: difference over the mean of the standard deviations of both
+            conditions.
+        p_wilcoxon: Two-sided p value of the signed-rank test, not corrected. Differences of
+            zero are left out.
+    """
+
+    measure: str
+    first: str
+    second: str
+    number: int
+    difference: float | None = None
+    interval: tuple[float, float] | None = None
+    t: float | None = None
+    p: float | None = None
+    p_holm: float | None = None
+    d_z: float | None = None
+    d_av: float | None = None
+    p_wilcoxon: float | None = None
+
+
+def compare_conditions(
+    rows: Sequence[Row], measure: str, *, unit: str = "participant"
+) -> list[Comparison]:
+    """Compares a measure between each pair of conditions, within participants or pairs.
+
+    Sources: Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J.
+    Statistics 6 (1979); Lakens, "Calculating and reporting effect sizes to facilitate
+    cumulative science", Frontiers in Psychology 4:863 (2013), for d_z and d_av.
+
+    Args:
+        rows: Trials, as for `average_trials`.
+        measure: Name of the measure.
+        unit: "participant" or "pair", which is sampled independently.
+
+    Returns:
+        A comparison for each pair of conditions, in the order of the rows.
+    """
+    means = average_trials(rows, measure, unit)
+    comparisons: list[Comparison] = []
+    for first, second in combinations(means, 2):
+        comparisons.append(_compare(measure, first, second, means))
+    corrected = correct_holm([comparison.p for comparison in comparisons])
+    return [
+        comparison._replace(p_holm=p)
+        for comparison, p in zip(comparisons, corrected, strict=True)
+    ]
+
+
+def _compare(
+    measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]
+) -> Comparison:
+    """Compares two conditions over the units that have both.
+
+    Args:
+        measure: Name of the measure.
+        first: Name of the first condition.
+        second: Name of the second condition.
+        means: Means by condition and unit.
+    """
+    units = [unit for unit in means[first] if unit in means[second]]
+    first_means = np.array([means[first][unit] for unit in units])
+    second_means = np.array([means[second][unit] for unit in units])
+    differences = second_means - first_means
+    untested = Comparison(measure, first, second, len(units))
+    if not units:
+        return untested
+    if len(units) < 2:
+        return untested._replace(difference=float(differences[0]))
+    mean = float(differences.mean())
+    spread = float(differences.std(ddof=1))
+    largest = max(np.abs(first_means).max(), np.abs(second_means).max())
+    if spread <= _ROUNDING * largest:
+        return untested._replace(difference=mean, interval=(mean, mean))
+    stats = import_scipy_stats()
+    test = stats.ttest_rel(second_means, first_means)
+    low, high = test.confidence_interval(CONFIDENCE)
+    sum_of_deviations = float(first_means.std(ddof=1) + second_means.std(ddof=1))
+    mean_deviation = sum_of_deviations / 2.0
+    return untested._replace(
+        difference=mean,
+        interval=(float(low), float(high)),
+        t=float(test.statistic),
+        p=float(test.pvalue),
+        d_z=mean / spread,
+        d_av=mean / mean_deviation,
+        p_wilcoxon=float(stats.wilcoxon(differences).pvalue),
+    )
+
+
+def correct_holm(p: Sequence[float | None]) -> list[float | None]:
+    """Corrects p values for the number of tests by Holm's method.
+
+    Without a correction, the more tests are made, the more of them are significant by chance.
+
+    Args:
+        p: p values. None does not count as a test.
+
+    Returns:
+        The corrected values in the same order. None stays None.
+    """
+    ascending = sorted((value, index) for index, value in enumerate(p) if value is not None)
+    corrected: list[float | None] = [None] * len(p)
+    largest = 0.0
+    for rank, (value, index) in enumerate(ascending):
+        remaining = len(ascending) - rank
+        # A corrected value is never below the corrected value of a smaller p.
+        largest = max(largest, min(1.0, remaining * value))
+        corrected[index] = largest
+    return corrected
+
+
+# --- mixed model ------------------------------------------------------------------------------
+
+
+class MixedEffect(NamedTuple):
+    """Effect of a condition relative to the first condition.
+
+    Args:
+        condition: Name of the condition.
+        estimate: Estimated difference from the first condition.
+        error: Standard error of the estimate.
+        interval: 95 % confidence interval of the estimate.
+        t: Estimate over its standard error.
+        p: Two-sided p value of t.
+    """
+
+    condition: str
+    estimate: float
+    error: float
+    interval: tuple[float, float]
+    t: float
+    p: float
+
+
+class MixedModel(NamedTuple):
+    """Mixed model of a measure, fitted to the means of participants by REML.
+
+    REML is the method of restricted maximum likelihood. The formula of the model is
+    `measure ~ condition + (1 | pair/participant)`: pairs, and participants within pairs, may
+    differ by random amounts.
+
+    Args:
+        measure: Name of the measure.
+        reference: The first condition, with which the other conditions are compared.
+        effects: Effect of each other condition.
+        freedom: Degrees of freedom of t: observations less participants less effects. They
+            equal those of the analysis of variance if all participants have all conditions.
+        variances: Variance of "pair", of "participant" within a pair, and of the "residual".
+        notes: Warnings of the fit, for example of a variance at 0.
+    """
+
+    measure: str
+    reference: str
+    effects: list[MixedEffect]
+    freedom: int
+    variances: dict[str, float]
+    notes: list[str]
+
+
+def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
+    """Fits a mixed model of a measure, with users nested within pairs.
+
+    The model is for measures of single users. A measure that both users of a pair share is
+    tested by `compare_conditions` with `unit="pair"`. The fit needs `pip install
+    'trilat-net[stats]'`.
+
+    Args:
+        rows: Trials, as for `average_trials`, with the keys "pair" and "participant".
+        measure: Name of the measure.
+
+    Raises:
+        UsageError: statsmodels is not installed, a participant is in two pairs, or there are
+            too few means to compare.
+    """
+    formulas = import_extra("statsmodels.formula.api", "stats", "mixed models")
+    frames = import_extra("pandas", "stats", "mixed models")
+    means = {
+        condition: means_by_user
+        for condition, means_by_user in average_trials(rows, measure).items()
+        if means_by_user
+    }
+    pairs = _find_pairs(rows)
+    records = []
+    for condition, means_by_user in means.items():
+        for user, mean in means_by_user.items():
+            records.append((pairs[user], user, condition, mean))
+    users = {user for _, user, _, _ in records}
+    freedom = len(records) - len(users) - len(means) + 1
+    if len(means) < 2 or freedom < 1:
+        mean_count = count_nouns(len(records), "mean")
+        user_count = count_nouns(len(users), "participant")
+        condition_count = count_nouns(len(means), "condition")
+        raise UsageError(
+            f"{measure}: {mean_count} of {user_count} under {condition_count}, "
+            "which is too few to compare two conditions"
+        )
+    frame = frames.DataFrame(records, columns=["pair", "participant", "condition", "measure"])
+    frame["condition"] = frames.Categorical(frame["condition"], categories=list(means))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit = _fit(formulas, frame, measure)
+    effects = [_read_effect(fit, name, freedom) for name in list(means)[1:]]
+    variances = {
+        "pair": float(fit.cov_re.iloc[0, 0]),
+        "participant": float(fit.vcomp[0]),
+        "residual": float(fit.scale),
+    }
+    notes = list(dict.fromkeys(str(warning.message) for warning in caught))
+    return MixedModel(
+        measure=measure,
+        reference=next(iter(means)),
+        effects=effects,
+        freedom=freedom,
+        variances=variances,
+        notes=notes,
+    )
+
+
+def _fit(formulas: Any, frame: Any, measure: str) -> Any:
+    """Fits a mixed model with two optimizers, and returns the fit with the larger likelihood.
+
+    Args:
+        formulas: The module `statsmodels.formula.api`.
+        frame: Data frame with a row for each mean.
+        measure: Name of the measure, for the error message.
+
+    Raises:
+        UsageError: Neither optimizer gives finite numbers.
+    """
+    parts = {"participant": "0 + C(participant)"}
+    model = formulas.mixedlm(
+        "measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts
+    )
+    fits = []
+    # The gradient method alone may stop before it reaches a variance of 0. Powell's method does
+    # not use the gradient.
+    for method in ("powell", "lbfgs"):
+        with suppress(np.linalg.LinAlgError):
+            fits.append(model.fit(reml=True, method=method))
+    finite_fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
+    if not finite_fits:
+        raise UsageError(
+            f"{measure}: no mixed model can be fitted to the means of this measure; "
+            "compare conditions instead"
+        )
+    return max(finite_fits, key=lambda fit: float(fit.llf))
+
+
+def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
+    """Returns the pair of each participant.
+
+    Raises:
+        UsageError: A participant is in two pairs, or no pair has two participants.
+    """
+    pairs: dict[str, str] = {}
+    for row in rows:
+        user = str(row["participant"])
+        pair = "" if row.get("pair") is None else str(row["pair"])
+        if pairs.setdefault(user, pair) != pair:
+            raise UsageError(
+                f"participant {user} is in pairs {pairs[user]} and {pair}: "
+                "a participant must belong to exactly one pair"
+            )
+    if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
+        raise UsageError(
+            "no pair has two participants: a mixed model needs users nested within pairs"
+        )
+    return pairs
+
+
+def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
+    """Returns the effect of a condition from a fit.
+
+    Args:
+        fit: The fit of statsmodels.
+        condition: Name of the condition.
+        freedom: Degrees of freedom of the t statistic.
+    """
+    stats = import_scipy_stats()
+    name = f"condition[T.{condition}]"
+    estimate = float(fit.fe_params[name])
+    error = float(fit.bse_fe[name])
+    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
+    p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
+    return MixedEffect(
+        condition=condition,
+        estimate=estimate,
+        error=error,
+        interval=(estimate - half, estimate + half),
+        t=estimate / error,
+        p=p,
+    )
+
+
+# --- power ------------------------------------------------------------------------------------
+
+
+def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
+    """Computes the power of a two-sided paired t test, by the noncentral t distribution.
+
+    The power is the probability that the test finds an effect of a given size.
+
+    Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988).
+
+    Args:
+        d_z: Size of the effect: mean over standard deviation of the differences.
+        number: Number of units.
+        alpha: Significance level.
+
+    Returns:
+        The power, from 0 to 1.
+
+    Raises:
+        UsageError: There are fewer than two units, or alpha is not between 0 and 1.
+    """
+    if number < 2 or not 0.0 < alpha < 1.0:
+        raise UsageError(
+            f"the number of units is {number} and alpha is {alpha}: "
+            "give at least two units, and an alpha between 0 and 1"
+        )
+    stats = import_scipy_stats()
+    shift = abs(d_z) * math.sqrt(number)
+    freedom = number - 1
+    critical = stats.t.ppf(1.0 - alpha / 2.0, freedom)
+    upper_tail = stats.nct.sf(critical, freedom, shift)
+    # The lower tail is computed from its mirror image: `nct.cdf` returns NaN for small tails.
+    lower_tail = stats.nct.sf(critical, freedom, -shift)
+    return float(upper_tail + lower_tail)
+
+
+def find_least_number(
+    d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
+) -> int:
+    """Returns the smallest number of units whose `power` is at least `wanted`.
+
+    Args:
+        d_z: Size of the effect: mean over standard deviation of the differences.
+        wanted: Desired power, between 0 and 1.
+        alpha: Significance level.
+        most: Largest number of units that is tried.
+
+    Raises:
+        UsageError: More than `most` units are needed, or `wanted` is not between 0 and 1.
+    """
+    if not 0.0 < wanted < 1.0 or power(d_z, most, alpha=alpha) < wanted:
+        raise UsageError(
+            f"a power of {wanted} at d_z = {d_z} cannot be reached with {most} units; "
+            "give a larger effect or a lower power"
+        )
+    return bisect_left(
+        range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha)
+    )
+
+
+class SimulatedPower(NamedTuple):
+    """Fraction of simulated experiments in which two conditions differ significantly.
+
+    It estimates the power: the probability that an experiment finds the simulated effect.
+
+    Args:
+        first: Name of the first condition.
+        second: Name of the second condition.
+        d_z: Size of the simulated effect.
+        found: Share of the experiments with p below alpha.
+        interval: 95 % interval of `found`.
+        found_holm: Share of the experiments with the corrected p below alpha.
+    """
+
+    first: str
+    second: str
+    d_z: float
+    found: float
+    interval: tuple[float, float]
+    found_holm: float
+
+
+def simulate_power(
+    means: Mapping[str, float],
+    number: int,
+    *,
+    trial_deviation: float,
+    trials: int = 1,
+    effect_deviation: float = 0.0,
+    alpha: float = 0.05,
+    repetitions: int = 500,
+    seed: int = 0,
+) -> list[SimulatedPower]:
+    """Computes the power for each pair of conditions from simulated experiments.
+
+    Trials are drawn from normal distributions and compared by `compare_conditions`.
+
+    Args:
+        means: Expected mean of a measure by condition.
+        number: Number of participants.
+        trial_deviation: Standard deviation from trial to trial.
+        trials: Number of trials of a participant under a condition.
+        effect_deviation: Standard deviation, over participants, of the effect of a condition.
+        alpha: Significance level of the tests.
+        repetitions: Number of simulated experiments.
+        seed: Seed of the random numbers.
+    """
+    generator = np.random.default_rng(seed)
+    experiments: list[list[Comparison]] = []
+    for _ in range(repetitions):
+        effects = generator.normal(0.0, effect_deviation, (number, len(means), 1))
+        noise = generator.normal(0.0, trial_deviation, (number, len(means), trials))
+        rows = _list_rows(effects + noise, means)
+        experiments.append(compare_conditions(rows, "measure"))
+    # Variance of the difference of two means, each of which varies by effect and by trial.
+    effect_variance = float(effect_deviation) ** 2
+    trial_variance = float(trial_deviation) ** 2
+    variance = 2.0 * (effect_variance + trial_variance / trials)
+    deviation = math.sqrt(variance)
+    powers: list[SimulatedPower] = []
+    for comparisons in zip(*experiments, strict=True):
+        difference = float(means[comparisons[0].second] - means[comparisons[0].first])
+        powers.append(_count_significant(comparisons, difference / deviation, alpha))
+    return powers
+
+
+def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
+    """Returns a row for each simulated trial.
+
+    Args:
+        values: Deviations from the means, by participant, condition and trial.
+        means: Expected mean of each condition.
+    """
+    rows: list[Row] = []
+    for index, (condition, mean) in enumerate(means.items()):
+        for user, deviations in enumerate(values[:, index]):
+            for deviation in deviations.tolist():
+                measure = mean + deviation
+                rows.append({"participant": user, "condition": condition, "measure": measure})
+    return rows
+
+
+def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
+    """Returns the share of comparisons of two conditions whose p is below alpha.
+
+    Args:
+        runs: Comparison of the two conditions in each simulated experiment.
+        d_z: Size of the simulated effect.
+        alpha: Significance level.
+    """
+    significant = sum(run.p is not None and run.p < alpha for run in runs)
+    significant_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
+    return SimulatedPower(
+        first=runs[0].first,
+        second=runs[0].second,
+        d_z=d_z,
+        found=significant / len(runs),
+        interval=wilson_interval(significant, len(runs)),
+        found_holm=significant_holm / len(runs),
+    )
+
+
+# --- methods paragraph ------------------------------------------------------------------------
+
+_METHODS = (
+    ("participants", "The data of {} participants"),
+    ("pairs", " in {} pairs"),
+    ("excluded", " were analysed; {} more were excluded"),
+    ("exclusions", " ({})"),
+    ("design", ". The design was {},"),
+    ("blocks", " in {} blocks"),
+    ("trials", " with {} trials of every participant under a condition."),
+    ("training", " {}."),
+    ("staircase", " {}."),
+    ("conditions", " Conditions, with delays as measured, were: {}."),
+    ("law", " The arms ran the control law {}"),
+    ("rate_hz", " at {}"),
+    ("gains", " with the gains {};"),
+    ("seeds", " random numbers had the seeds {}"),
+    ("program", "; the program was {}"),
+    ("digest", "; the digest of the protocol is {}"),
+    ("measures", ". Measures were {}, averaged"),
+    ("unit", " per {}"),
+)  # fmt: skip
+"""Each fact and the text that states it, in the order of the paragraph."""
+COMPUTED = (
+    "t tests", "wilcoxon", "effect sizes", "intervals", "bootstrap", "sign tests",
+    "mixed models",
+)  # fmt: skip
+"""Analyses that the paragraph describes if they were computed."""
+_ENDING = ("correction", "alpha", "completion", "answers", "computed")
+"""Facts that the last sentences state."""
+_OPTIONAL = (
+    "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest",
+    "unit", "alpha", "completion", "answers", "computed",
+)  # fmt: skip
+"""Facts that may be missing."""
+
+
+def write_methods(facts: Mapping[str, Any]) -> str:
+    """Writes the methods paragraph of a paper, which states every number of the facts.
+
+    Args:
+        facts: Facts by name. Keys of numbers end in their unit.
+            `participants`: number of participants whose data count.
+            `excluded`: number of further participants; `exclusions`: the reasons.
+            `pairs`, `design`, `blocks`: number of pairs, the design, number of blocks.
+            `trials`: number of trials of a participant under a condition.
+            `training`, `staircase`: their descriptions.
+            `conditions`: the settings of each condition by its name, with the measured delay
+            (`delay_ms`).
+            `law`, `gains`, `rate_hz`, `seeds`: of the arms' control and the random numbers.
+            `measures`: names of the measures; `unit`: the unit over which they are averaged.
+            `correction`, `alpha`: correction of p, and the significance level.
+            `program`, `digest`: version of the program, and digest of the protocol.
+            `computed`: the analyses of `COMPUTED` that were computed, by default none of them.
+            `completion`, `answers`: sentences on trials that were not completed and on missing
+            answers.
+
+    Raises:
+        UsageError: A fact is missing or unknown, or a condition has no delay.
+    """
+    _check_facts(facts)
+    texts = {key: _format_fact(value, key) for key, value in facts.items()}
+    conditions: list[str] = []
+    for name, condition in facts["conditions"].items():
+        conditions.append(f"{name} ({_format_fact(condition)})")
+    texts["conditions"] = "; ".join(conditions)
+    measures = [" in ".join(filter(None, split_unit(name))) for name in facts["measures"]]
+    texts["measures"] = ", ".join(measures)
+    first_parts = [text.format(texts[key]) for key, text in _METHODS if texts.get(key)]
+    sentences = [
+        f"{''.join(first_parts)} over the trials of a condition",
+        texts.get("completion"),
+        texts.get("answers"),
+    ]
+    sentences += _describe_computed(frozenset(facts.get("computed", ())), texts)
+    text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
+    # The templates are in the plural.
+    singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
+    return singular.replace("; 1 more were excluded", "; 1 more was excluded")
+
+
+def _check_facts(facts: Mapping[str, Any]) -> None:
+    """Checks that the facts of a methods paragraph are known and complete.
+
+    Raises:
+        UsageError: A fact is missing or unknown, or a condition has no delay.
+    """
+    known = [*(key for key, _ in _METHODS), *_ENDING]
+    missing = [key for key in known if key not in facts and key not in _OPTIONAL]
+    if missing:
+        raise UsageError(f"a methods paragraph needs {', '.join(missing)}")
+    unknown = [key for key in facts if key not in known]
+    if unknown:
+        raise UsageError(
+            f"unknown facts: {', '.join(unknown)}; the known facts are {', '.join(known)}"
+        )
+    unknown_analyses = [name for name in facts.get("computed", ()) if name not in COMPUTED]
+    if unknown_analyses:
+        raise UsageError(
+            f"unknown analyses: {', '.join(unknown_analyses)}; "
+            f"the known analyses are {', '.join(COMPUTED)}"
+        )
+    for name, condition in facts["conditions"].items():
+        if not any(key.startswith("delay") for key in condition):
+            raise UsageError(
+                f"condition {name} has no delay: "
+                "give the measured delay_ms, or 0 if there was no delay"
+            )
+
+
+def _describe_computed(computed: frozenset[str], texts: Mapping[str, str]) -> Iterator[str]:
+    """Yields a sentence for each analysis that was computed.
+
+    If the conditions were not compared by any test, a sentence says so.
+
+    Args:
+        computed: Names of the analyses that were computed.
+        texts: Facts of the paragraph as texts.
+    """
+    correction = f"with p corrected by {texts['correction']} over all comparisons of a measure"
+    level = f", at alpha = {texts['alpha']}" if texts.get("alpha") else ""
+    if "t tests" in computed:
+        wilcoxon = ""
+        if "wilcoxon" in computed:
+            wilcoxon = " and by Wilcoxon's signed-rank test beside them"
+        tests = "conditions were compared by two-sided paired t tests"
+        yield f"{tests}, {correction}{level}{wilcoxon}"
+    if "sign tests" in computed:
+        rule = "in which a median that was not reached is longer than any that was reached"
+        by_sign = f"by exact two-sided sign tests on the medians, {rule}"
+        yield f"completion times were compared {by_sign}, {correction}{level}"
+    if "mixed models" in computed:
+        yield (
+            "forces of users were compared by mixed models, "
+            "with pair and user as random effects (REML)"
+        )
+    if computed.isdisjoint({"t tests", "sign tests", "mixed models"}):
+        yield "conditions were not compared by tests"
+    if "effect sizes" in computed:
+        yield "effect sizes are Cohen's d_z and d_av"
+    if "intervals" in computed:
+        bootstrap = ""
+        if "bootstrap" in computed:
+            bootstrap = f" and by the bootstrap (BCa, {RESAMPLES} resamples)"
+        yield f"intervals are of {100 * CONFIDENCE:g} %, by Student's t{bootstrap}"
+
+
+def _capitalise(sentence: str) -> str:
+    """Returns a sentence with a capital first letter. Other letters are unchanged."""
+    return sentence[0].upper() + sentence[1:]
+
+
+def _format_fact(value: Any, key: str = "") -> str:
+    """Returns a fact as text, with all digits of its numbers and the unit of its key."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Mapping):
+        items: list[str] = []
+        for name, item in value.items():
+            quantity, _ = split_unit(name)
+            items.append(f"{quantity} {_format_fact(item, name)}")
+        return ", ".join(items)
+    if isinstance(value, Sequence):
+        return ", ".join(_format_fact(item, key) for item in value)
+    number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
+    _, unit = split_unit(key)
+    return f"{number} {unit}".strip()

@@ -1,0 +1,561 @@
+"""Runs and judges one trial of an experiment, and computes its measures from its log.
+
+In a trial the participants move the slave arm over the network, to do a task such as reaching a
+target. `ExperimentTrial` is a trial with people, recorded by a live session. `SyntheticTrial`
+is a trial of synthetic participants, which are models of people, and runs in virtual time.
+
+Invariant:
+    - The result of a trial follows from its log. The log is executed again, and the task is
+      judged by the state of the slave in every period of its control loop.
+    - A trial of synthetic participants is simulated twice. The first simulation is fast, writes
+      no log, and finds out when the trial ends. The second simulation repeats the same motion,
+      writes the log, and stops shortly after this end.
+"""
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from trilat_net.analysis.aligned import AlignedRecords, align_records
+from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows
+from trilat_net.analysis.link_summary import sample_ages_ns
+from trilat_net.analysis.torque_sources import split_torque
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import LogError
+from trilat_net.execution.fused import FusedRun
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual import record_virtual
+from trilat_net.files import digest_file
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.record_columns import Ints
+from trilat_net.log.site_log import SiteLog
+from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
+from trilat_net.scenario.scenario_types import Change
+
+from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
+from .protocol import PlannedTrial, Protocol, limit_forces
+from .synthetic_participant import ParticipantModel, SyntheticParticipant
+from .tasks import Outcome, TrialGoal
+
+RECORD_STEP = 5
+"""Every fifth record of the slave is measured."""
+HAND_HZ = 50
+"""Rate at which a synthetic participant acts, in 1/s."""
+HAND_DELAY_S = 0.02
+"""Time from the decision of a synthetic participant to the effect on the arm, in s."""
+REST_S = 0.1
+"""Time for which the log of a trial continues after the trial's end, in s."""
+
+
+class TrialEntry(msgspec.Struct, frozen=True):
+    """Result of a finished trial, as the journal of the experiment stores it.
+
+    Attributes:
+        cell: Number of the trial.
+        seed: Seed of the trial.
+        sha256: Digest of the trial's log.
+        succeeded: True if the task was done.
+        measures: Measures by name, with units in the names.
+        people: False for synthetic participants.
+    """
+
+    cell: int
+    seed: int
+    sha256: str
+    succeeded: bool
+    measures: dict[str, float]
+    people: bool = False
+
+
+class TrialJudge:
+    """Decides during a trial whether it has ended, from the records of the slave arm.
+
+    The records are passed on one after the other, as they arrive.
+
+    Args:
+        trial: The trial, with its scenario, slave arm and goal.
+
+    Attributes:
+        goal: Goal of the trial.
+        outcome: Outcome of the trial. None while the trial goes on.
+    """
+
+    def __init__(self, trial: "ExperimentTrial") -> None:
+        self.goal = trial.make_goal()
+        self._trial = trial
+        self.outcome: Outcome | None = None
+
+    def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
+        """Takes the next record of the slave into account.
+
+        Args:
+            t_s: Time since the start of the session, in s.
+            q: Joint positions, in rad or m.
+            tau_x: Minus the torques of hands and environments ON the arms, in N m or N.
+
+        Returns:
+            The outcome once the trial has ended. None before.
+        """
+        if self.outcome is None:
+            # The force is computed only for tasks that need it, because it takes long.
+            force_n = 0.0
+            if self.goal.force_n:
+                force_n = self._trial.find_force_n(q, tau_x)
+            position = self._trial.arm.end_effector(q)
+            position_m = np.array(position)
+            self.outcome = self.goal.judge(t_s, position_m, force_n)
+        return self.outcome
+
+
+class _MotionSamples(NamedTuple):
+    """Motion of the slave's end effector in a trial, from which its measures are computed.
+
+    There are K samples at a constant rate.
+
+    Attributes:
+        indices: Indices of the records, shape (K,).
+        t_s: Times of the records, shape (K,), in s.
+        positions_m: Positions, shape (K, 2) or (K, 3), in m.
+        velocities_m_s: Velocities, of the same shape, in m/s.
+        rate_hz: Rate of the samples, in 1/s.
+    """
+
+    indices: Ints
+    t_s: Array
+    positions_m: Array
+    velocities_m_s: Array
+    rate_hz: float
+
+
+class ExperimentTrial:
+    """One trial of an experiment with people: its scenario, its goal, and its result.
+
+    Args:
+        protocol: Protocol of the experiment, with the task and the users.
+        scenario: Scenario of the condition: the arms, their control and the network.
+        planned: Entry of this trial in the list of all trials, with its participants, its
+            condition and its seed.
+        digest: Checksum that identifies the list of all trials. It is stored in the log.
+
+    Attributes:
+        people: False for synthetic participants, which are models of people.
+        protocol: Same as the argument.
+        planned: Same as the argument.
+        slave: Name of the slave in the scenario.
+        arm: Model of the slave arm.
+        scenario: Scenario of this trial, with the longest duration that the trial may have.
+        appears_s: Time at which the target appears, in s.
+        longest_s: Latest end of the trial, in s.
+    """
+
+    people = True
+
+    def __init__(
+        self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str
+    ) -> None:
+        self.protocol = protocol
+        self.planned = planned
+        self.slave = scenario.slave
+        self.arm = scenario.arms[scenario.slave]
+        start_q = scenario.sites[self.slave].q0_rad
+        start = self.arm.end_effector(start_q)
+        self._start_m = np.array(start, dtype=np.float64)
+
+        shortest_s, longest_s = protocol.foreperiod_s
+        random = np.random.default_rng(planned.seed)
+        foreperiod_s = random.uniform(shortest_s, longest_s)
+        self.appears_s = round(float(foreperiod_s), 3)
+
+        scenario = self._set_authority(scenario)
+        # Synthetic participants act, and their trial is judged, once per 1 / HAND_HZ. The end
+        # of a trial may be noticed that late.
+        latest_end_s = self.appears_s + protocol.task.longest_s
+        self.longest_s = latest_end_s + 1.0 / HAND_HZ
+        kind = "" if self.people else "synthetic "
+        participants = ", ".join(planned.group)
+        about = (
+            f"trial {planned.number} of {protocol.name}: {kind}{participants}, "
+            f"condition {planned.condition}, block {planned.block}, trial {planned.trial}; "
+            f"protocol sha256 {digest}"
+        )
+        limited_sites = limit_forces(scenario, protocol, planned.group)
+        self.scenario = replace(
+            scenario,
+            duration_s=self.longest_s + REST_S,
+            seed=planned.seed,
+            about=about,
+            sites={**scenario.sites, **limited_sites},
+        )
+        self._rows = build_arm_rows(self.scenario, self.slave)
+
+    def _set_authority(self, scenario: Scenario) -> Scenario:
+        """Returns the scenario with the users' authority over the slave in this trial.
+
+        The two users share the sum of their dominance factors, which are the weights with which
+        the slave follows them. A handover exchanges the parts during the trial.
+        """
+        goal = self.make_goal()
+        if goal.lead is None:
+            return scenario
+        row = scenario.dominance[self.slave]
+        first, second = self.protocol.users
+        sum_of_shares = row[first] + row[second]
+
+        def divide_shares(lead: float) -> dict[str, float]:
+            """Returns the weights with which the slave arm follows the other arms.
+
+            Args:
+                lead: First user's part of the authority over the slave, from 0 to 1. The second
+                    user has the rest.
+            """
+            first_share = sum_of_shares * lead
+            second_share = sum_of_shares - first_share
+            return {
+                **row,
+                first: first_share,
+                second: second_share,
+            }
+
+        dominance = {
+            **scenario.dominance,
+            self.slave: divide_shares(goal.lead),
+        }
+        timeline = scenario.timeline
+        if goal.handover is not None:
+            after_s, ramp_s = goal.handover
+            handover = Change(
+                self.appears_s + after_s,
+                dominance=self.slave,
+                to=divide_shares(1.0 - goal.lead),
+                ramp_s=ramp_s,
+            )
+            timeline = (*timeline, handover)
+        return replace(scenario, dominance=dominance, timeline=timeline)
+
+    def find_force_n(self, q: Sequence[float], tau_x: Sequence[float]) -> float:
+        """Computes the magnitude of the external force on the slave's end effector, in N.
+
+        Args:
+            q: Joint positions, in rad or m.
+            tau_x: Minus the torques of hands and environments ON the arms, in N m or N.
+        """
+        forces_n = self._find_forces_n(np.array([q]), np.array([tau_x]))
+        return float(forces_n[0])
+
+    def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
+        """Returns the magnitude of the external force in K records, shape (K,), in N."""
+        forces = self._place_end_effector(q).find_force(tau_x)
+        magnitude_n: Array = np.linalg.norm(forces, axis=1)
+        return magnitude_n
+
+    def _place_end_effector(self, q: Array) -> EndEffectorRows:
+        """Returns the positions of the slave's end effector, and the Jacobians, at rest."""
+        speed = 0.0 * q
+        return self._rows.place_end_effector(q, speed)
+
+    def make_goal(self) -> TrialGoal:
+        """Creates the goal of the trial, which states its target and decides when it ends."""
+        planned = self.planned
+        task = self.protocol.task
+        goal = task.make_goal(self._start_m, planned.target, planned.seed)
+        goal.appears_s = self.appears_s
+        # The task of a handover fixes the authority; otherwise the plan does.
+        if goal.lead is None:
+            goal.lead = planned.lead
+        return goal
+
+    def settle(self, path: Path) -> TrialEntry:
+        """Verifies the log of the trial, and computes the trial's result from it.
+
+        The run is executed again from the log. The result counts only if the records are the
+        same.
+
+        Args:
+            path: Path of the log.
+
+        Returns:
+            The result, as the journal stores it.
+
+        Raises:
+            LogError: The records are not those of a run, or they end before the trial does.
+        """
+        log = open_log(path)
+        if not verify(log).passed:
+            raise LogError(f"{path}: the records differ from those of a repeated run")
+        outcome = self._judge_log(log)
+        if outcome is None:
+            raise LogError(f"{path}: the log ends before the trial does")
+        return TrialEntry(
+            cell=self.planned.number,
+            seed=self.planned.seed,
+            sha256=digest_file(path),
+            succeeded=outcome.succeeded,
+            measures=self._measure(log, outcome),
+            people=self.people,
+        )
+
+    def _judge_log(self, log: Log) -> Outcome | None:
+        """Returns the outcome of the trial in a log. None if the log ends before the trial."""
+        judge = TrialJudge(self)
+        records = log[self.slave]
+        times_s = records.t_s.tolist()
+        positions = records.q.tolist()
+        torques = records.tau_x.tolist()
+        for t_s, q, tau_x in zip(times_s, positions, torques, strict=True):
+            outcome = judge.accept(t_s, q, tau_x)
+            if outcome is not None:
+                return outcome
+        if log.diverged_s is not None:
+            return Outcome(False, log.diverged_s)
+        return None
+
+    def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
+        """Computes the measures of a trial, with units in the names.
+
+        They are the measures of the slave's motion, the forces and the work of each user, and
+        the mean age of the first user's samples at the slave.
+        """
+        measures = self._measure_motion(log, outcome.ended_s)
+        aligned = align_records(log)
+        users = self.protocol.users
+        forces: list[Array] = []
+        for number, user in enumerate(users, 1):
+            records = aligned[user]
+            split = split_torque(records, log.scenario)
+            end_effector = split.end_effector
+            is_in_trial = records.t_s <= outcome.ended_s
+            # The force of the hand ON its arm, shape (K, 2) or (K, 3).
+            hand_force = end_effector.find_force(split.operator)
+            force = hand_force[is_in_trial]
+            forces.append(force)
+            magnitude_n = np.linalg.norm(force, axis=1)
+            velocity = end_effector.speed[is_in_trial]
+            suffix = ""
+            if len(users) > 1:
+                suffix = f"_user{number}"
+            measures[f"force_mean{suffix}_n"] = float(magnitude_n.mean())
+            measures[f"force_peak{suffix}_n"] = float(magnitude_n.max())
+            measures[f"work{suffix}_j"] = energy_j(force, velocity, records.rate_hz)
+        if len(forces) > 1:
+            measures |= self._measure_pair(aligned, forces, outcome.ended_s)
+        age_ms = sample_ages_ns(log, self.slave, users[0]) / 1e6
+        mean_age_ms = 0.0
+        if len(age_ms):
+            mean_age_ms = float(age_ms.mean())
+        measures["delay_ms"] = mean_age_ms
+        return measures
+
+    def _sample_motion(
+        self, records: SiteLog | AlignedRecords, start_s: float, end_s: float
+    ) -> _MotionSamples:
+        """Returns the motion of the slave's end effector between two times."""
+        has_started = records.t_s >= start_s
+        is_between = has_started & (records.t_s <= end_s)
+        indices = np.flatnonzero(is_between)[::RECORD_STEP]
+        end_effector = self._place_end_effector(records.q[indices])
+        positions_m = end_effector.position
+        rate_hz = records.rate_hz / RECORD_STEP
+        velocities_m_s = np.gradient(positions_m, 1.0 / rate_hz, axis=0)
+        return _MotionSamples(
+            indices=indices,
+            t_s=records.t_s[indices],
+            positions_m=positions_m,
+            velocities_m_s=velocities_m_s,
+            rate_hz=rate_hz,
+        )
+
+    def _measure_pair(
+        self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
+    ) -> dict[str, float]:
+        """Computes the measures of two users, as if each pushed at the slave's end effector.
+
+        Args:
+            aligned: Records of each site.
+            forces: Forces of each user in the user's records, in N.
+            ended_s: End of the trial, in s.
+        """
+        motion = self._sample_motion(aligned[self.slave], 0.0, ended_s)
+        interpolated: list[Array] = []
+        for user, force in zip(self.protocol.users, forces, strict=True):
+            # The times of the user's records differ from those of the slave's records.
+            force_t_s = aligned[user].t_s[: len(force)]
+            columns: list[Array] = []
+            for component in force.T:
+                column = np.interp(motion.t_s, force_t_s, component)
+                columns.append(column)
+            interpolated.append(np.column_stack(columns))
+        first, second = interpolated
+        pair = measure_pair(first, second, motion.velocities_m_s, motion.rate_hz)
+        measures = pair._asdict()
+        return {name: value for name, value in measures.items() if value is not None}
+
+    def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
+        """Computes the measures of the slave's motion after the target has appeared."""
+        goal = self.make_goal()
+        records = log[self.slave]
+        motion = self._sample_motion(records, goal.appears_s, ended_s)
+        speed = np.linalg.norm(motion.velocities_m_s, axis=1)
+        onset_speed = 0.05 * speed.max()
+        is_moving = speed > onset_speed
+        targets = [goal.find_target_m(t_s) for t_s in motion.t_s]
+        targets_m = np.array(targets)
+        error_vectors_m = motion.positions_m - targets_m
+        errors_m = np.linalg.norm(error_vectors_m, axis=1)
+        rms_error_m = float(np.sqrt(np.mean(errors_m**2)))
+        first_moving = float(np.argmax(is_moving))
+        force_n = 0.0 * motion.t_s
+        if goal.force_n:
+            q = records.q[motion.indices]
+            tau_x = records.tau_x[motion.indices]
+            force_n = self._find_forces_n(q, tau_x)
+        measures = {
+            "completion_s": ended_s - goal.appears_s,
+            "movement_s": movement_time_s(speed, motion.rate_hz) or 0.0,
+            "reaction_s": first_moving / motion.rate_hz,
+            "error_end_mm": 1e3 * float(errors_m[-1]),
+            "error_rms_mm": 1e3 * rms_error_m,
+            "path_m": path_length_m(motion.positions_m),
+        }
+        smoothness = sparc(speed, motion.rate_hz)
+        if smoothness is not None:
+            measures["sparc"] = smoothness
+        after_s = motion.t_s - goal.appears_s
+        measures |= goal.compute_measures(after_s, motion.positions_m, force_n)
+        points = {
+            "start": goal.start_m,
+            "target": targets_m[-1],
+            "end": motion.positions_m[-1],
+        }
+        for name, point in points.items():
+            # The end effector of a planar arm has no z.
+            for axis, coordinate_m in zip("xyz", point, strict=False):
+                measures[f"{name}_{axis}_m"] = float(coordinate_m)
+        return measures
+
+
+class SyntheticTrial(ExperimentTrial):
+    """A trial in which models of people (synthetic participants) move the master arms.
+
+    It runs in virtual time, without a network.
+    """
+
+    people = False
+
+    def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
+        """Returns the synthetic participants of the trial, by their sites."""
+        players: dict[str, HandPlayer] = {}
+        pairs = zip(self.protocol.users, self.planned.group, strict=True)
+        for user_index, (site, name) in enumerate(pairs):
+            hand = scenario.sites[site].find_live_hand(is_open=True)
+            # `plan_experiment` has checked that the scenario has the hands of all users.
+            assert hand is not None
+            hand_site = HandSite(
+                scenario=scenario,
+                name=site,
+                spec=hand,
+                rate_hz=HAND_HZ,
+                delay_s=HAND_DELAY_S,
+            )
+            participant = SyntheticParticipant(
+                facts=hand_site.describe(),
+                model=self._draw_model(name),
+                goal=self.make_goal(),
+                slave=(self.slave, self.arm, self.find_force_n),
+                before=self.planned.before,
+                seed=self.planned.seed,
+                user=user_index,
+            )
+            players[site] = HandPlayer(hand_site, participant)
+        return players
+
+    def _draw_model(self, participant: str) -> ParticipantModel:
+        """Returns the parameters of a participant, which are the same in every trial."""
+        text = f"{self.protocol.seed}/{participant}"
+        digest = hashlib.sha256(text.encode()).digest()
+        participant_seed = int.from_bytes(digest[:4], "big")
+        return self.protocol.model.draw(participant_seed)
+
+    def find_end_s(self) -> float:
+        """Finds out how long the trial lasts, by a fast run without a log.
+
+        Returns:
+            The end of the trial, in s since the start of the session.
+        """
+        scenario = self.scenario
+        judge = TrialJudge(self)
+        slave = self.slave
+        ticks_per_period = scenario.sites[slave].rate_hz // HAND_HZ
+        players = self._make_players(scenario)
+        run = FusedRun(scenario, keep=ticks_per_period + 1, hands=players)
+        tick_counts = [scenario.ticks(name) for name in scenario.names]
+        run.plan(tick_counts)
+        slave_index = scenario.names.index(slave)
+        columns = scenario.layout(slave).columns()
+        q_columns = columns["q"]
+        torque_columns = columns["tau_x"]
+        # The run is judged after each period of the hands.
+        period_count = math.ceil(self.longest_s * HAND_HZ)
+        for period in range(period_count):
+            period_end_ns = (period + 1) * NS_PER_S // HAND_HZ
+            run.step_to(period_end_ns)
+            records = run.pop_records()
+            t_ns, rows = records[slave_index]
+            times_s = (t_ns / NS_PER_S).tolist()
+            positions = rows[:, q_columns].tolist()
+            torques = rows[:, torque_columns].tolist()
+            for t_s, q, tau_x in zip(times_s, positions, torques, strict=True):
+                judge.accept(t_s, q, tau_x)
+            if judge.outcome is not None:
+                return judge.outcome.ended_s
+            if run.diverged_s is not None:
+                return run.diverged_s
+        return self.longest_s
+
+    def write(self, path: Path) -> TrialEntry:
+        """Runs the trial, writes its log, and returns its result.
+
+        Args:
+            path: Path of the log.
+        """
+        duration_s = self.find_end_s() + REST_S
+        scenario = replace(self.scenario, duration_s=duration_s)
+        players = self._make_players(scenario)
+        hands = {site: player.track for site, player in players.items()}
+        record_virtual(
+            scenario,
+            path,
+            force=True,
+            views_hz=0.0,
+            hands=hands,
+        )
+        return self.settle(path)
+
+
+def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
+    """Runs a trial of synthetic participants, which are models of people, and keeps its log.
+
+    Worker processes call this function. All inputs are in one argument, because it is sent to
+    the worker as a whole.
+
+    Args:
+        task: The protocol of the experiment, the text of the scenario, the planned trial, the
+            digest that identifies the plan of all trials, and the folder of the log.
+
+    Returns:
+        The result of the trial.
+
+    Raises:
+        LogError: The written log does not reproduce the run.
+    """
+    protocol, text, planned, digest, folder = task
+    scenario = parse_scenario(text)
+    trial = SyntheticTrial(protocol, scenario, planned, digest)
+    return trial.write(folder / planned.file)

@@ -1,0 +1,608 @@
+"""Identifies mass, damping and stiffness of a person's hand from the log of a run.
+
+A person holds the arm of a site, a process that runs one arm and its control loop. At any site,
+a simulated operator of the kind `multisine` moves the arms with a sum of sines. The force F of
+the hand on the arm and the position X of the end effector contain responses to the sines. At
+the angular frequency w of each sine, these responses satisfy
+
+    F(j w) = -(M (j w)^2 + B j w + K) X(j w)
+
+with the mass M, the damping B and the stiffness K of the hand, which are matrices over the axes
+of space. The person's voluntary movements do not follow the sines. Therefore the contribution
+of these movements vanishes in the mean over segments of the run. In the terms of system
+identification, the sines are an instrument. M, B and K are fitted by weighted least squares.
+Their confidence intervals come from the jackknife, which repeats the fit without one segment at
+a time.
+
+Sources:
+    - Stiffness along several axes at once: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
+      "Multiple-input, multiple-output system identification for characterization of limb
+      stiffness dynamics", Biological Cybernetics 80 (1999).
+    - Sines in a closed loop: R. Pintelon, J. Schoukens, "System identification: a frequency
+      domain approach" (2012), ch. 2 and 7.
+    - Confidence intervals: B. Efron, "The jackknife, the bootstrap and other resampling plans"
+      (1982).
+
+Invariant:
+    - F is the force, in N, with which the hand pushes the arm. The force of sines that act on
+      the same arm is not part of it.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.special import stdtrit
+
+from trilat_net.analysis.aligned import AlignedRecords, align_records
+from trilat_net.analysis.theory.characteristic_roots import Complex
+from trilat_net.analysis.torque_sources import compute_operator_script, split_torque
+from trilat_net.core.arms.exogenous import SCRIPTED_KINDS
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import UsageError, count_nouns
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.presentation.result_text import Block, TextTable
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario, find_site
+from trilat_net.scenario.operators.kernel_operators import Multisine
+
+MIN_SEGMENTS = 5
+"""Smallest number of segments for confidence intervals."""
+MIN_KNOWN_SHARE = 0.98
+"""Smallest fraction of a segment's records that must be in the log."""
+NEIGHBOUR_CORRELATION = 1.0 / 6.0
+"""Correlation of white noise in two segments with a Hann window that overlap by half."""
+MAX_CONDITION = 1e3
+"""Largest condition number of the motions with which the axes can be distinguished."""
+_TINY = 1e-300
+"""Smallest divisor, so that 0 / 0 gives 0."""
+UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
+"""Unit of each matrix."""
+
+
+class _SineResponse(NamedTuple):
+    """Response of the hand and the arm to one of the sines that shake the arm.
+
+    To identify the hand that holds an arm, small forces of several frequencies act on the arm.
+    The run is divided into segments, whose spectra are compared.
+
+    Attributes:
+        hz: The frequency, in Hz.
+        motion_mm: Amplitude of the motion over all axes, in mm.
+        force_n: Amplitude of the force over all axes, in N.
+        coherence: Fraction of the motion or of the force, whichever is smaller, that repeats
+            from segment to segment. It is 1 if all segments are equal.
+        unexplained: Fraction of the force that M, B and K do not explain.
+    """
+
+    hz: float
+    motion_mm: float
+    force_n: float
+    coherence: float
+    unexplained: float
+
+
+@dataclass(frozen=True, repr=False)
+class HandImpedance(Result):
+    """Identified mass, damping and stiffness of the hand that holds an arm.
+
+    The model of the hand is force = M acceleration + B velocity + K displacement. The entry in
+    a row and a column of a matrix is the force along the axis of the row per motion along the
+    axis of the column.
+
+    Attributes:
+        site: Site of the arm that the hand holds.
+        M: Mass, force per acceleration, in kg, shape (n, n).
+        B: Damping, force per velocity, in N s/m, shape (n, n).
+        K: Stiffness, force per displacement, in N/m, shape (n, n).
+        halves: Half the width of the 95 % intervals of "M", "B" and "K", shape (n, n) each.
+        segments: Number of segments of the run.
+        segment_s: Duration of a segment, in s.
+        responses: Responses at the frequencies of the sines, in rising order.
+    """
+
+    site: str
+    M: Array
+    B: Array
+    K: Array
+    halves: dict[str, Array]
+    segments: int
+    segment_s: float
+    responses: tuple[_SineResponse, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the identified hand to plain values for a JSON file.
+
+        The values are the matrices, their intervals and the measured responses. The command
+        `trilat linear --operators` reads the file.
+        """
+        return {
+            "site": self.site,
+            "segments": self.segments,
+            "segment_s": self.segment_s,
+            "mass_kg": self.M.tolist(),
+            "damping_n_s_m": self.B.tolist(),
+            "stiffness_n_m": self.K.tolist(),
+            "mass_kg_half": self.halves["M"].tolist(),
+            "damping_n_s_m_half": self.halves["B"].tolist(),
+            "stiffness_n_m_half": self.halves["K"].tolist(),
+            "hand": self.to_hand(),
+            "sines": self.to_rows(),
+        }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a table of the hand's motion and force, one row per shaking frequency."""
+        return [response._asdict() for response in self.responses]
+
+    def to_hand(self) -> dict[str, Any]:
+        """Returns settings of the simulated operator that is most similar to this hand.
+
+        This operator consists of a spring and a damper along each axis, and has no mass. The
+        settings are the entries of its table in a scenario, the file that describes an
+        experiment.
+        """
+        return {
+            "kind": "tip_spring",
+            "stiffness_n_m": _round_diagonal(self.K),
+            "damping_n_s_m": _round_diagonal(self.B),
+        }
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat identify hand` prints.
+
+        The parts are the mass, damping and stiffness matrices with their confidence intervals,
+        a table of the motion and force at each frequency of the shaking, and the settings of
+        the most similar simulated operator.
+        """
+        segments = count_nouns(self.segments, "segment")
+        yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
+        yield self._tabulate_matrices()
+        sine_rows = [_format_response(response) for response in self.responses]
+        heads = ("sine", "motion", "force", "coherence", "unexplained")
+        units = ("Hz", "mm", "N")
+        yield TextTable(heads, sine_rows, "r", units)
+        settings: list[str] = []
+        for key, value in self.to_hand().items():
+            text = json.dumps(value)
+            settings.append(f"{key} = {text}")
+        table = ", ".join(settings)
+        yield f"in a scenario, without the mass of the hand: hands = [{{ {table} }}]"
+
+    def _tabulate_matrices(self) -> TextTable:
+        """Returns a table with a row for each of M, B and K, and a column for each entry.
+
+        The columns are named by their axes, as in "xy". Each cell has the value and half the
+        width of its interval.
+        """
+        axes = "xyz"[: len(self.K)]
+        entries = list(product(range(len(axes)), repeat=2))
+        heads = [axes[row] + axes[column] for row, column in entries]
+        rows: list[tuple[str, ...]] = []
+        for letter, unit in UNITS.items():
+            matrix = getattr(self, letter)
+            half = self.halves[letter]
+            cells = [f"{letter}, {unit}"]
+            for entry in entries:
+                value = matrix[entry]
+                half_width = half[entry]
+                cells.append(f"{value:.4g} +- {half_width:.2g}")
+            rows.append(tuple(cells))
+        return TextTable(("", *heads), rows, align="lr")
+
+
+def _format_response(response: _SineResponse) -> tuple[str, ...]:
+    """Returns the numbers of a response as texts with three digits."""
+    return tuple(f"{value:.3g}" for value in response)
+
+
+def _round_diagonal(matrix: Array) -> list[float]:
+    """Returns the diagonal of a matrix with four digits, where negative entries become 0."""
+    rounded: list[float] = []
+    for value in np.diag(matrix):
+        four_digits = float(f"{value:.4g}")
+        rounded.append(max(0.0, four_digits))
+    return rounded
+
+
+def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
+    """Identifies mass, damping and stiffness of the hand that holds an arm.
+
+    While the person holds the arm, a simulated operator must shake the arms with a sum of sines
+    (kind `multisine`). The command is `trilat identify hand`.
+
+    >>> hand = tn.identify_hand("run.mcap", "m1")  # doctest: +SKIP
+    >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP
+
+    Args:
+        log: Log of the run, or its path.
+        site: Name of the arm that the hand holds.
+
+    Returns:
+        The matrices M, B and K. `halves` contains half the widths of their 95 % intervals.
+
+    Raises:
+        UsageError: The run has no such arm or no sines, the run is too short, or the motion
+            along some axes is too similar to separate them.
+    """
+    if not isinstance(log, Log):
+        log = open_log(log)
+    scenario = log.scenario
+    find_site(scenario, site)
+    sines = _find_sines(scenario)
+    records = align_records(log)[site]
+    force, position = _compute_hand_force(records, scenario)
+
+    # A segment lasts two periods of the smallest spacing between frequencies (or of the lowest
+    # frequency), so that the window separates the sines.
+    frequencies_hz = np.concatenate([[0.0], sines.hz])
+    smallest_spacing_hz = np.diff(frequencies_hz).min()
+    segment_s = float(np.round(2.0 / smallest_spacing_hz, 9))
+    is_before_end = records.t_s < sines.end_s
+    signals = np.hstack((force, position))[is_before_end]
+    phasors = _compute_phasors(
+        records=records,
+        signals=signals,
+        hz=sines.hz,
+        start_s=sines.start_s,
+        segment_s=segment_s,
+    )
+    if len(phasors) < MIN_SEGMENTS:
+        segments = count_nouns(len(phasors), "whole segment")
+        needed_segments = 0.5 * MIN_SEGMENTS + 1.0
+        needed_s = sines.start_s + needed_segments * segment_s
+        raise UsageError(
+            f"{site}: the log has {segments} of {segment_s:g} s in which the sines act, but "
+            f"the confidence intervals need {MIN_SEGMENTS}: record a run of at least "
+            f"{needed_s:g} s"
+        )
+
+    axis_count = force.shape[1]
+    F, X = np.split(np.array(phasors), [axis_count], axis=2)
+    rates_rad_s = 2.0 * np.pi * sines.hz
+    fit = _fit_with_intervals(site, F, X, rates_rad_s)
+    M, B, K = fit.matrices
+    halves = dict(zip(UNITS, fit.halves, strict=True))
+    return HandImpedance(
+        site=site,
+        M=M,
+        B=B,
+        K=K,
+        halves=halves,
+        segments=len(phasors),
+        segment_s=segment_s,
+        responses=_list_responses(F, X, sines.hz, fit.unexplained),
+    )
+
+
+def _list_responses(
+    F: Complex, X: Complex, hz: Array, unexplained: Array
+) -> tuple[_SineResponse, ...]:
+    """Returns the response at each frequency, averaged over the segments.
+
+    Args:
+        F: Phasors of the force, shape (segments, F, n), in N.
+        X: Phasors of the position, shape (segments, F, n), in m.
+        hz: The F frequencies, in Hz.
+        unexplained: Fraction of the force that the fit does not explain, shape (F,).
+    """
+    force_coherence = _compute_coherence(F)
+    motion_coherence = _compute_coherence(X)
+    coherence = np.minimum(force_coherence, motion_coherence)
+    mean_motion = X.mean(axis=0)
+    motion_mm = 1e3 * np.linalg.norm(mean_motion, axis=1)
+    mean_force = F.mean(axis=0)
+    force_n = np.linalg.norm(mean_force, axis=1)
+    responses: list[_SineResponse] = []
+    for index, frequency_hz in enumerate(hz):
+        response = _SineResponse(
+            hz=float(frequency_hz),
+            motion_mm=float(motion_mm[index]),
+            force_n=float(force_n[index]),
+            coherence=float(coherence[index]),
+            unexplained=float(unexplained[index]),
+        )
+        responses.append(response)
+    return tuple(responses)
+
+
+class _Sines(NamedTuple):
+    """Sines of force that shake the arm, so that the hand can be identified from its response.
+
+    Attributes:
+        hz: Frequencies of all sines in rising order, in Hz.
+        start_s: Time from which all sines act, in s.
+        end_s: Time until which all sines act, in s.
+    """
+
+    hz: Array
+    start_s: float
+    end_s: float
+
+
+def _find_sines(scenario: Scenario) -> _Sines:
+    """Finds the sines that simulated operators of a scenario apply, at any site.
+
+    Raises:
+        UsageError: The scenario has no sines.
+    """
+    multisines: list[Multisine] = []
+    for spec in scenario.sites.values():
+        multisines += [hand for hand in spec.hands if isinstance(hand, Multisine)]
+    if not multisines:
+        raise UsageError(
+            "no operator of kind 'multisine' in the scenario moves an arm, so the "
+            "reaction of a hand cannot be distinguished from its own movements "
+            "(docs/studies/measured-hands.md)"
+        )
+    frequencies_hz: list[float] = []
+    for multisine in multisines:
+        frequencies_hz += map(float, multisine.frequencies_hz)
+    return _Sines(
+        hz=np.unique(frequencies_hz),
+        start_s=max(multisine.start_s for multisine in multisines),
+        end_s=min(multisine.end_s for multisine in multisines),
+    )
+
+
+def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array, Array]:
+    """Computes the force of the hand ON the end effector, and the position of the end effector.
+
+    The recorded torque of the operators contains the hand and the simulated operators of the
+    same site. Operators that follow a script, such as sines, are subtracted from it.
+
+    Args:
+        records: Records of the site.
+        scenario: Scenario of the run.
+
+    Returns:
+        The force in N and the position in m, shape (K, n) each for K records.
+    """
+    split = split_torque(records, scenario)
+    end_effector = split.end_effector
+    scripted_torque = np.zeros_like(records.q)
+    for hand in scenario.sites[records.site].hands:
+        source = hand.actor
+        if source.kind in SCRIPTED_KINDS:
+            scripted_torque += compute_operator_script(
+                source,
+                records.nominal_s,
+                end_effector.J[0],
+            )
+    hand_torque = split.operator - scripted_torque
+    force = end_effector.find_force(hand_torque)
+    return force, end_effector.position
+
+
+def _compute_phasors(
+    records: AlignedRecords, signals: Array, hz: Array, start_s: float, segment_s: float
+) -> list[Complex]:
+    """Computes the phasors of signals at the frequencies of the sines, segment by segment.
+
+    A phasor is the complex amplitude of a signal at one frequency. Segments have a Hann window
+    and overlap by half. The spectrum of the window is zero at the other sines, which are two or
+    more multiples of 1 / segment_s away. The spectrum falls with the third power of the
+    frequency. Therefore transients and drift, which are slower than the sines, hardly
+    contribute. The first half segment is left out. Segments with too many missing records are
+    skipped.
+
+    Args:
+        records: Records of the site.
+        signals: The signals, shape (K, signals).
+        hz: The F frequencies, in Hz.
+        start_s: Time from which all sines act, in s.
+        segment_s: Duration of a segment, in s.
+
+    Returns:
+        For each segment, phasors of shape (F, signals).
+    """
+    size = round(segment_s * records.rate_hz)
+    half_s = 0.5 * segment_s
+    first_tick = round((start_s + half_s) * records.rate_hz)
+    first_row = max(first_tick - records.first, 0)
+    end_row = len(signals) - size + 1
+    step = size // 2
+    window_phase = 2.0 * np.pi * np.arange(size) / size
+    window = 0.5 - 0.5 * np.cos(window_phase)
+    window_sum = window.sum()
+    phasors: list[Complex] = []
+    for start in range(first_row, end_row, step):
+        rows = slice(start, start + size)
+        known_share = records.known[rows].mean()
+        if known_share < MIN_KNOWN_SHARE:
+            continue
+        segment = signals[rows]
+        cycles = np.outer(hz, records.t_s[rows])
+        carriers = np.exp(-2j * np.pi * cycles)
+        mean = window @ segment / window_sum
+        deviation = segment - mean
+        phasors.append(2.0 / window_sum * (carriers * window) @ deviation)
+    return phasors
+
+
+def _compute_coherence(phasors: Complex) -> Array:
+    """Returns the coherence of phasors over segments and all axes, shape (F,).
+
+    If z is the phasor of a segment, the coherence is |mean of z|^2 / mean of |z|^2, where the
+    means are taken over the segments. It is 1 if all segments are equal, and near 0 if the
+    phasors are random.
+
+    Args:
+        phasors: The phasors, shape (segments, F, n).
+    """
+    squares = np.abs(phasors) ** 2
+    power = squares.mean(axis=0).sum(axis=1)
+    mean_phasors = phasors.mean(axis=0)
+    squares_of_mean = np.abs(mean_phasors) ** 2
+    power_of_mean = squares_of_mean.sum(axis=1)
+    coherence: Array = power_of_mean / np.maximum(power, _TINY)
+    return coherence
+
+
+class _HandFit(NamedTuple):
+    """Mass, damping and stiffness of a hand, fitted to measured forces and motions.
+
+    There are n axes and F frequencies.
+
+    Attributes:
+        matrices: M, B and K, shape (3, n, n).
+        halves: Half the width of their 95 % intervals, shape (3, n, n).
+        unexplained: Fraction of the force that the fit does not explain, shape (F,).
+    """
+
+    matrices: Array
+    halves: Array
+    unexplained: Array
+
+
+def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit:
+    """Fits M, B and K to phasors, and estimates their confidence intervals by the jackknife.
+
+    Args:
+        site: Name of the site, for the error message.
+        F: Phasors of the force, shape (segments, F, n), in N.
+        X: Phasors of the position, shape (segments, F, n), in m.
+        w: Angular frequencies, shape (F,), in rad/s.
+
+    Raises:
+        UsageError: The motions do not distinguish the axes, or mass, damping and stiffness.
+    """
+    count, _, axes = X.shape
+    s = 1j * w[:, np.newaxis]
+    acceleration = s**2 * X
+    velocity = s * X
+    motions = -np.concatenate((acceleration, velocity, X), axis=2)
+    if not _can_distinguish(motions):
+        raise UsageError(
+            f"{site}: the end effector moved along fewer than {count_nouns(axes, 'axis')}, "
+            "or at too few frequencies to distinguish mass, damping and stiffness: "
+            "let sines of other frequencies act on another joint"
+        )
+
+    all_segments = np.arange(count)
+    forces = F.transpose(2, 0, 1)
+    estimate = _fit_all_axes(forces, motions, all_segments)
+
+    # The jackknife leaves out one segment at a time.
+    partial_estimates: list[Array] = []
+    for segment in range(count):
+        others = all_segments[all_segments != segment]
+        partial_estimates.append(_fit_all_axes(forces, motions, others))
+    freedom = count - 1
+    pseudo_values = count * estimate - freedom * np.array(partial_estimates)
+    # Neighbouring segments overlap and are correlated, which widens the interval.
+    inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * freedom / count
+    deviation = pseudo_values.std(axis=0, ddof=1)
+    student_quantile = stdtrit(freedom, 0.975)
+    halves = student_quantile * deviation * np.sqrt(inflation / count)
+
+    mean_force = F.mean(axis=0)
+    fitted_force = motions.mean(axis=0) @ estimate.T
+    force_error = mean_force - fitted_force
+    residual = np.linalg.norm(force_error, axis=1)
+    force_size = np.linalg.norm(mean_force, axis=1)
+    # The rows of M, B and K for an axis follow each other in the estimate.
+    matrix_rows = estimate.reshape(axes, 3, axes)
+    half_rows = halves.reshape(axes, 3, axes)
+    return _HandFit(
+        matrices=matrix_rows.transpose(1, 0, 2),
+        halves=half_rows.transpose(1, 0, 2),
+        unexplained=residual / np.maximum(force_size, _TINY),
+    )
+
+
+def _fit_all_axes(forces: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
+    """Returns the rows of M, B and K for each axis, shape (n, 3 n), by `_fit_impedance`.
+
+    Args:
+        forces: Phasors of the force along each axis, shape (n, segments, F).
+        motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+        segments: Indices of the segments to average.
+    """
+    impedances = [_fit_impedance(force, motions, segments) for force in forces]
+    return np.array(impedances)
+
+
+def _can_distinguish(motions: Complex) -> bool:
+    """Returns whether the motions determine mass, damping and stiffness along all axes.
+
+    They do so if there are enough frequencies, and if the motions along the axes, and their
+    derivatives, are linearly independent up to the condition number `MAX_CONDITION`.
+
+    Args:
+        motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+    """
+    mean_motion = motions.mean(axis=0)
+    design = _stack_real_and_imaginary(mean_motion)
+    column_sizes = np.linalg.norm(design, axis=0)
+    normalised = design / np.maximum(column_sizes, _TINY)
+    singular_values = np.linalg.svd(normalised, compute_uv=False)
+    largest = singular_values[0]
+    smallest = singular_values[-1]
+    is_singular = smallest * MAX_CONDITION < largest
+    equation_count, unknown_count = design.shape
+    return equation_count >= unknown_count and not is_singular
+
+
+def _stack_real_and_imaginary(phasors: Complex) -> Array:
+    """Returns the real parts followed by the imaginary parts, along the first axis.
+
+    This turns complex equations into twice as many real ones.
+    """
+    return np.concatenate((phasors.real, phasors.imag))
+
+
+def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
+    """Estimates mass, damping and stiffness of a hand for the force along one axis.
+
+    The model is force = motions @ impedance. It is solved by weighted least squares: at each
+    frequency, the residual averaged over the segments is divided by the standard deviation of
+    the residuals over the segments, so that noisy frequencies count less. The standard
+    deviation itself depends on the impedance, because the person's own movements make the
+    measured motion noisy too. Therefore the problem is nonlinear and needs a first guess, which
+    comes from ordinary least squares.
+
+    Args:
+        force: Phasors of the force along the axis, shape (segments, F).
+        motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+        segments: Indices of the segments to average.
+
+    Returns:
+        The rows of M, B and K for this axis, shape (3 n,).
+    """
+    mean_motion = motions[segments].mean(axis=0)  # shape (F, 3 n)
+    mean_force = force[segments].mean(axis=0)  # in N, shape (F,)
+    smallest_deviation = 1e-6 * np.abs(mean_force).max()  # avoids a division by zero
+
+    def compute_weighted_residuals(impedance: Array) -> Array:
+        """Computes how far the measured force is from the force of the hand model.
+
+        At each frequency, the difference is averaged over the segments of the run, and divided
+        by its standard deviation over the segments. The forces and motions, and their means,
+        are those of the enclosing function.
+
+        Args:
+            impedance: Rows of the mass M, damping B and stiffness K for the axis of the force,
+                one after the other, shape (3 n,). n is the number of axes of the motion.
+
+        Returns:
+            The real parts and then the imaginary parts, shape (2 F,), for F frequencies. They
+            have no unit.
+        """
+        residuals = force - motions @ impedance  # in N, shape (segments, F)
+        deviation_over_segments = residuals.std(axis=0)
+        deviation = np.maximum(deviation_over_segments, smallest_deviation)
+        mean_residual = mean_force - mean_motion @ impedance  # in N, shape (F,)
+        return _stack_real_and_imaginary(mean_residual / deviation)
+
+    design = _stack_real_and_imaginary(mean_motion)
+    values = _stack_real_and_imaginary(mean_force)
+    first_guess = np.linalg.lstsq(design, values, rcond=None)[0]
+    fit = least_squares(compute_weighted_residuals, first_guess, x_scale="jac")
+    impedance: Array = fit.x
+    return impedance

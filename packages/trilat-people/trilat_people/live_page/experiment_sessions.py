@@ -1,0 +1,467 @@
+"""Runs an experiment with people: a live session per trial, on one set of browser pages.
+
+A session is a run in which several processes each control one robot arm, and a trial is one
+execution of a task. The participants open their pages once. For each trial of the protocol this
+module starts a session, shows it on the pages of the experimenter and the participants, checks
+the recorded log, and writes the result to the journal of the experiment. Between trials it
+collects consents and questionnaires.
+
+Invariant:
+    - A trial counts only if its log exists and is valid. The log is moved to its final place
+      before the journal mentions the trial. If this process dies at any moment, no completed
+      trial is lost, and no incomplete trial is counted.
+    - Every attempt at a trial has its own folder. If the attempt does not count, its folder is
+      kept, together with a note of the reason.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from trilat_net.app.demo_session import SessionResult, compile_core, run_demo
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.errors import LogError, LogRefused, RunFailed
+from trilat_net.files import describe_write_error, make_subfolder
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.signals import Interrupt
+
+from ..experiment.experiment_run import LOGS, Experiment, Note
+from ..experiment.protocol import PlannedTrial, Step
+from ..experiment.trial_run import ExperimentTrial
+from .experiment_stage import Stage, TrialWatch
+from .page_server import PageOptions, PageServer
+
+ATTEMPTS = "tries"
+"""Name of the folder of the attempts at trials, in the folder of the experiment."""
+POLL_NS = 20_000_000
+"""Time between two checks for the replies of participants, in ns."""
+FAREWELL_NS = NS_PER_S
+"""Time between the last step and the end of the server, in ns.
+
+In this time every page receives that the experiment has ended.
+"""
+EARLY_FAILURE_NS = 60 * NS_PER_S
+"""Time within which a session that fails before its beginning would fail again, in ns."""
+
+SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
+"""A function that runs the session of a trial until the trial is over or people end it.
+
+Its arguments are the watch of the trial, the folder of the attempt, and a function that returns
+True once the session may begin.
+"""
+
+
+@dataclass
+class ExperimentSessions:
+    """Runs the remaining steps of an experiment with people, one after another.
+
+    The steps are consents, questionnaires and trials. Each trial runs in a session of its own.
+
+    Attributes:
+        experiment: The experiment, with its plan and the journals of completed steps.
+        stage: Controls what the pages show between the sessions, and collects the participants'
+            replies.
+        clock: Clock of this process.
+        run_session: Function that runs the session of a trial.
+        ends: Function that returns True once the experiment must end for now.
+        say: Function that prints a line for the user.
+    """
+
+    experiment: Experiment
+    stage: Stage
+    clock: Clock
+    run_session: SessionRunner
+    ends: Callable[[], bool]
+    say: Callable[[str], None]
+
+    def run(self) -> bool:
+        """Runs the remaining steps. Steps that were completed earlier are skipped.
+
+        Returns:
+            True if all steps are completed. False if the experiment was ended earlier.
+
+        Raises:
+            LogRefused: The disk refused a file. Everything that was done is kept.
+            UsageError: The experiment is one of synthetic participants.
+        """
+        trials = self.experiment.open_trials(people=True)
+        notes = self.experiment.open_notes()
+        with trials as self._trials, notes as self._notes:
+            done = {entry.cell for entry in self._trials.done.values()}
+            for step in self.experiment.plan.list_steps():
+                if step.kind != "trial":
+                    is_done = self._request_step(step)
+                elif step.planned.number in done:
+                    is_done = True
+                else:
+                    is_done = self._run_trial(step)
+                if not is_done:
+                    return False
+            self.stage.show_end()
+        return True
+
+    def _request_step(self, step: Step, rest_s: float = 0.0) -> bool:
+        """Waits until every user has completed a step, and notes consents and answers.
+
+        A step is a consent, a questionnaire, or the readiness for a trial. The users complete
+        it on their web pages, which the stage controls. A note is an entry of the experiment's
+        journal, which survives a restart of this program. It records the consent or the answers
+        of one user.
+
+        Args:
+            step: The step.
+            rest_s: Rest before the step, in s.
+
+        Returns:
+            True if every user has completed the step. False if the experiment was ended before.
+        """
+        pseudonyms = dict(zip(self.stage.users, step.planned.group, strict=True))  # by site
+        note_keys = {site: f"{step.key} {who}" for site, who in pseudonyms.items()}
+        # The journal identifies an entry by its key and a seed, which is 0 for all notes.
+        sites_done_earlier = [
+            site for site, key in note_keys.items() if (key, 0) in self._notes.done
+        ]
+        request = self.stage.request_step(step, rest_s, sites_done_earlier)
+        note_count_before = len(self._notes.done)
+        form_name = step.form.name if step.form else ""
+
+        while not request.replies.keys() >= pseudonyms.keys():
+            if self.ends():
+                return False
+            self.clock.sleep_until(self.clock.monotonic_ns() + POLL_NS)
+            # A user who is ready for a trial leaves no note.
+            if step.kind == "trial":
+                continue
+            # Every poll offers all replies. The journal ignores those that it contains already.
+            for site, (answers, _) in list(request.replies.items()):
+                self._add_note(
+                    cell=note_keys[site],
+                    kind=step.kind,
+                    who=pseudonyms[site],
+                    number=step.planned.number,
+                    text=form_name,
+                    answers=answers,
+                )
+        has_new_notes = len(self._notes.done) > note_count_before
+        if has_new_notes:
+            self.experiment.write_tables()
+        return True
+
+    def _add_note(
+        self,
+        *,
+        cell: str,
+        kind: str,
+        who: str,
+        number: int,
+        text: str,
+        answers: Mapping[str, float | None] = {},
+    ) -> None:
+        """Adds a note to the journal, unless the journal has a note of the same key already.
+
+        Args:
+            cell: Key of the note.
+            kind: Kind of the note, such as "consent" or "aborted".
+            who: Pseudonym of the participant, or of all participants of the trial.
+            number: Number of the trial.
+            text: Name of the questionnaire, or a reason.
+            answers: Answers to a questionnaire. None for an item without an answer.
+        """
+        unix_s = round(self.clock.unix_ns() / NS_PER_S, 3)
+        note = Note(
+            cell=cell,
+            kind=kind,
+            who=who,
+            number=number,
+            unix_s=unix_s,
+            text=text,
+            answers=dict(answers),
+        )
+        self._notes.add(note)
+
+    def _run_trial(self, step: Step) -> bool:
+        """Repeats a trial until one attempt counts.
+
+        An attempt is one session of the trial, with a folder of its own. If an earlier start of
+        this program was ended during the trial, it may have left a finished log, which is
+        counted now, or an unfinished attempt, which is noted as aborted.
+
+        Args:
+            step: The step of the trial.
+
+        Returns:
+            True if an attempt counts. False if the experiment was ended before.
+        """
+        plan = self.experiment.plan
+        planned = step.planned
+        scenario = plan.find_scenario(planned, self.experiment.list_choices())
+        trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
+        log_path = make_subfolder(self.experiment.folder / LOGS) / planned.file
+        # The log exists if the program was killed before it had counted the trial.
+        if log_path.exists():
+            reason_against = self._count_trial(trial, log_path)
+            if not reason_against:
+                return True
+
+        earlier_attempts = self._list_attempts(planned)
+        if earlier_attempts:
+            last_attempt = earlier_attempts[-1]
+            has_begun_log = any(last_attempt.glob("*.mcap*"))
+            if has_begun_log:
+                self._record_aborted(planned, "the program was ended")
+            else:
+                # The session of the attempt had not begun.
+                shutil.rmtree(last_attempt, ignore_errors=True)
+
+        rest_s = plan.rest_before_s(planned)
+        while True:
+            counts = self._run_attempt(step, trial, log_path, rest_s)
+            if counts:
+                return True
+            if self.ends():
+                return False
+            rest_s = 0.0  # the users have rested before the first attempt
+
+    def _list_attempts(self, planned: PlannedTrial) -> list[Path]:
+        """Returns the folders of the attempts at a trial, the oldest first."""
+        attempts = self.experiment.folder / ATTEMPTS
+        return sorted(attempts.glob(f"{planned.number:05d}-*"))
+
+    def _record_aborted(self, planned: PlannedTrial, reason: str) -> None:
+        """Notes why the newest attempt does not count, unless the reason is noted already."""
+        last_attempt = self._list_attempts(planned)[-1]
+        self._add_note(
+            cell=f"aborted {last_attempt.name}",
+            kind="aborted",
+            who="-".join(planned.group),
+            number=planned.number,
+            text=reason,
+        )
+        self.experiment.write_tables()
+
+    def _run_attempt(
+        self, step: Step, trial: ExperimentTrial, path: Path, rest_s: float
+    ) -> bool:
+        """Runs the session of a trial once all users are ready.
+
+        Args:
+            step: The step of the trial.
+            trial: The trial.
+            path: Final place of the log.
+            rest_s: Rest before the trial, in s.
+
+        Returns:
+            True if the trial counts.
+
+        Raises:
+            LogRefused: The disk refused the log.
+            RunFailed: The session failed before it began, and would fail again.
+        """
+        number = len(self._list_attempts(step.planned)) + 1
+        begun_ns = self.clock.monotonic_ns()
+        attempts = make_subfolder(self.experiment.folder / ATTEMPTS)
+        folder = make_subfolder(attempts / f"{step.planned.number:05d}-{number:02d}")
+        watch = TrialWatch(trial, self.clock)
+        request = self.stage.request_step(step, rest_s)
+        has_begun = False
+
+        def begins() -> bool:
+            """Returns True once all participants have said on their pages that they are ready.
+
+            At that moment the pages change to the picture of the trial.
+            """
+            nonlocal has_begun
+            if not has_begun and request.replies.keys() >= set(self.stage.users):
+                has_begun = True
+                self.stage.show_trial(watch)
+            return has_begun
+
+        try:
+            result = self.run_session(watch, folder, begins)
+        except OSError as error:
+            raise describe_write_error(folder, error) from None
+        self.stage.show_checking()
+        if result.problems and result.exit_code == LogRefused.exit_code:
+            raise LogRefused("; ".join(result.problems))
+        if not has_begun:
+            # People have ended the experiment, or the sites have waited for too long.
+            shutil.rmtree(folder, ignore_errors=True)
+            elapsed_ns = self.clock.monotonic_ns() - begun_ns
+            if result.problems and elapsed_ns < EARLY_FAILURE_NS:
+                raise RunFailed("; ".join(result.problems))
+            return False
+
+        reason = _find_repeat_reason(watch, result)
+        if not reason:
+            result.log.replace(path)
+            reason = self._count_trial(trial, path)
+        if reason:
+            self._record_aborted(step.planned, reason)
+            self.stage.show_feedback(None, reason)
+            self.say(f"trial {step.planned.number} must be repeated: {reason}")
+        return not reason
+
+    def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:
+        """Judges a trial by its log, and writes the result to the journal.
+
+        A log that cannot be judged is moved back to the folder of its attempt.
+
+        Args:
+            trial: The trial.
+            path: The log, in its final place.
+
+        Returns:
+            The reason why the trial does not count. Empty if it counts.
+        """
+        attempts = self._list_attempts(trial.planned)[-1:]
+        try:
+            entry = trial.settle(path)
+        except LogError as error:
+            folder = attempts[0] if attempts else self.experiment.folder
+            path.replace(folder / path.name)
+            return str(error)
+
+        self._trials.add(entry)
+        for folder in attempts:
+            shutil.rmtree(folder, ignore_errors=True)
+        self.stage.show_feedback(entry)
+        self.experiment.write_tables()
+        planned = trial.planned
+        total = len(self.experiment.plan.trials)
+        outcome = "succeeded" if entry.succeeded else "failed"
+        completion_s = entry.measures["completion_s"]
+        self.say(
+            f"trial {planned.number} of {total}, {', '.join(planned.group)}, "
+            f"{planned.condition}: {outcome} after {completion_s:.2f} s"
+        )
+        return ""
+
+
+def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
+    """Returns the reason why a trial must be repeated. Empty if it counts.
+
+    A trial in which an arm has diverged is not repeated: it counts as failed.
+    """
+    if result.interrupted:
+        return "the experiment was interrupted"
+    problems = "; ".join(result.problems)
+    if watch.aborted:
+        return watch.aborted
+    if not result.log.exists():
+        return problems or "there is no log"
+    return "" if watch.diverged else problems
+
+
+def run_with_people(
+    experiment: Experiment, options: PageOptions, say: Callable[[str], None]
+) -> int:
+    """Continues an experiment with people, from its first step that is not completed.
+
+    The experiment is shown on web pages, one for each participant and one for the experimenter.
+
+    Args:
+        experiment: The experiment, with its plan and the journals of completed steps.
+        options: How the pages are served.
+        say: Function that prints a line for the user.
+
+    Returns:
+        The exit code of the command.
+
+    Raises:
+        LogRefused: The disk refused a file. Everything that was done is kept.
+        UsageError: The experiment is one of synthetic participants.
+    """
+    clock = SystemClock()
+    plan = experiment.plan
+    stage = Stage(plan, clock)
+    name = plan.protocol.name
+    with Interrupt() as interrupt, closing(ZenohBus()) as idle:
+        for scenario in plan.scenarios.values():
+            compile_core(scenario, say, interrupt)
+        with PageServer(idle, clock, name, options, ends=True, say=say, stage=stage) as page:
+
+            def run_session(
+                watch: TrialWatch, folder: Path, begins: Callable[[], bool]
+            ) -> SessionResult:
+                """Runs the session of one trial, and shows it on the experiment's web pages.
+
+                A trial is one execution of the experiment's task. The function uses the server
+                `page` of the web pages, the network connection `idle` that the pages observe
+                between the sessions, and the signal handler `interrupt` of the experiment. If a
+                signal ends the session, for example Ctrl-C, the whole experiment ends too.
+
+                Args:
+                    watch: The trial and its present state.
+                    folder: Folder for the log and for the output of the processes.
+                    begins: Function that returns True once the session may begin.
+
+                Returns:
+                    The result of the session, which contains the path of its log.
+                """
+                # `run_demo` passes the remaining arguments: the session and its addresses.
+                show_session_on_pages = partial(_show_session, page, idle, watch)
+                result = run_demo(
+                    scenario=watch.trial.scenario,
+                    folder=folder,
+                    console=Console(quiet=True),
+                    attend=show_session_on_pages,
+                    begins=begins,
+                )
+                # Both are the number of the signal that arrived, or 0. The first one is kept.
+                interrupt.number = interrupt.number or result.interrupted
+                return result
+
+            def ends() -> bool:
+                """Returns True once a signal or a page has requested the end."""
+                return interrupt.is_requested() or page.end_requested.is_set()
+
+            sessions = ExperimentSessions(
+                experiment=experiment,
+                stage=stage,
+                clock=clock,
+                run_session=run_session,
+                ends=ends,
+                say=say,
+            )
+            if sessions.run():
+                clock.sleep_until(clock.monotonic_ns() + FAREWELL_NS)
+    return interrupt.exit_code if interrupt.is_requested() else 0
+
+
+@contextmanager
+def _show_session(
+    page: PageServer,
+    idle: Bus,
+    watch: TrialWatch,
+    session: str,
+    endpoints: Sequence[str],
+    _say: Callable[[str], None],
+) -> Iterator[Callable[[], bool]]:
+    """Shows the session of a trial on the pages, in the form of a `SessionAttendant`.
+
+    After the session the pages observe the experiment's own network connection, on which
+    nothing happens, so that the connection to the session can be closed.
+
+    Args:
+        page: Server of the pages.
+        idle: Network connection of the experiment.
+        watch: Judge of the trial.
+        session: Name of the session.
+        endpoints: Network addresses at which the session can be reached.
+
+    Yields:
+        A function that returns True once the session should end.
+    """
+    with closing(ZenohBus([], endpoints)) as bus:
+        page.show(bus, session)
+        try:
+            yield lambda: watch.over or page.end_requested.is_set()
+        finally:
+            page.show(idle, watch.trial.protocol.name)

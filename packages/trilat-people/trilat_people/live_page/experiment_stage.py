@@ -1,0 +1,454 @@
+"""Controls what the pages of an experiment show: consent, readiness, trials, questionnaires.
+
+A trial is one execution of a task by the participants, in a session of its own. The `Stage`
+requests the steps between the trials from the users and collects their replies. A `TrialWatch`
+judges a trial while its session runs.
+
+Invariant:
+    - A reply counts only for the step that the page showed, and only from the first page of a
+      user's site.
+    - A trial is judged by every record of the slave arm, the arm that follows the users. A
+      record is the stored result of one period of its control loop. The later evaluation of the
+      log uses the same records.
+    - Rests of the users and absences of pages are measured on the monotonic clock, which is
+      never set, so that a correction of the time of day changes no duration.
+    - The pages of users never show the condition of the experiment, such as the delay or the
+      control law, because this knowledge could influence the users.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from trilat_net.core.step.ticks import NS_PER_S, tick_ns
+from trilat_net.errors import UsageError
+from trilat_net.net.clock import Clock
+from trilat_net.net.messages import HALTED_MODES
+
+from ..experiment.protocol import ExperimentPlan, Step
+from ..experiment.trial_run import ExperimentTrial, TrialEntry, TrialJudge
+from .page_orders import AbortTrial, StageMessage
+from .session_view import SessionView
+
+MAX_ABSENCE_NS = 8 * NS_PER_S
+"""Absence of a user's page after which a trial is aborted, in ns; a reload takes less time."""
+END_DELAY_NS = NS_PER_S // 2
+"""Time between the end of a trial and the end of its session, in ns.
+
+In this time the mark of the trial's end reaches the log.
+"""
+
+Json = dict[str, Any]
+"""A JSON object."""
+
+
+class TrialWatch:
+    """Decides during a trial whether it succeeds, fails or must be repeated.
+
+    A trial is one execution of a task by the participants, in a session of its own. The pages
+    call `poll` many times a second while the session runs.
+
+    Args:
+        trial: The trial, with its task and the names of its sites.
+        clock: Clock of this process.
+
+    Attributes:
+        trial: The trial.
+        judge: Evaluates the records of the slave arm, one after another, and finds the outcome.
+        aborted: Reason why the trial must be repeated. Empty if it need not be repeated.
+        diverged: True if an arm has exceeded a safety limit, which makes the trial fail.
+    """
+
+    def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
+        self.trial = trial
+        self.judge = TrialJudge(trial)
+        self.aborted = ""
+        self._clock = clock
+        self._next_tick = 0
+        self._ended_ns = 0
+        self._has_appeared = False
+        self.diverged = False
+
+    @property
+    def over(self) -> bool:
+        """True once the session of the trial can end."""
+        if self.aborted:
+            return True
+        has_outcome = self.judge.outcome is not None
+        return has_outcome and self._clock.monotonic_ns() - self._ended_ns > END_DELAY_NS
+
+    def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
+        """Judges the trial by new records of the slave arm, and finds reasons to repeat it.
+
+        A record contains what the process of an arm measured and computed in one control
+        period. The trial must be repeated if an arm was stopped, or if the web page of a
+        participant has disappeared. The records are then not judged.
+
+        Args:
+            view: Present state of the session.
+            absent: Sites (processes, one per arm) whose participant's page has been missing for
+                too long.
+
+        Returns:
+            Texts to write into the log as events at the present time. Empty if nothing has
+            happened, or if the trial has ended.
+        """
+        if self.over or self.judge.outcome is not None or not view.running:
+            return []
+        modes = {name: site.record.mode for name, site in view.sites.items() if site.record}
+        self.diverged = "diverged" in modes.values()
+        halted = [name for name, mode in modes.items() if mode in HALTED_MODES]
+        if absent:
+            self.aborted = f"the page of {', '.join(absent)} is gone"
+        elif halted:
+            self.aborted = f"{', '.join(halted)} stopped"
+        if self.aborted:
+            return [f"trial {self.trial.planned.number} aborted: {self.aborted}"]
+        return self._judge_records(view)
+
+    def _judge_records(self, view: SessionView) -> list[str]:
+        """Judges the complete records up to the outcome of the trial.
+
+        Returns:
+            Texts that the log should keep as marks of this moment.
+        """
+        slave = view.sites[self.trial.slave]
+        number = self.trial.planned.number
+        moments: list[str] = []
+        first = max(self._next_tick, slave.window.first)
+        last = slave.complete
+        if last < first:
+            return []
+        if self._next_tick == 0:
+            moments.append(f"trial {number} begins")
+        self._next_tick = last + 1
+        rows = slave.window.rows(first, last)
+        are_known = rows.known.tolist()
+        positions = rows.q.tolist()
+        torques = rows.tau_x.tolist()
+        ticks = range(first, last + 1)
+        records = zip(ticks, are_known, positions, torques, strict=True)
+        for tick, is_known, q, tau_x in records:
+            t_s = tick_ns(tick, slave.window.rate_hz) / NS_PER_S
+            if not self._has_appeared and t_s >= self.trial.appears_s:
+                self._has_appeared = True
+                moments.append("target appears")
+            outcome = self.judge.accept(t_s, q, tau_x) if is_known else None
+            if outcome is not None:
+                self._ended_ns = self._clock.monotonic_ns()
+                result = "succeeded" if outcome.succeeded else "failed"
+                return [*moments, f"trial {number} {result}"]
+        return moments
+
+    def describe(self, t_s: float, site: str) -> Json:
+        """Describes the target that the participants must reach now, for a page.
+
+        Args:
+            t_s: Time of the pose that the page shows, counted in the trial, in s.
+            site: Name of the site of the page's user. If it is empty, the target lies in the
+                middle of the targets of all users.
+
+        Returns:
+            Position and width of the target, the corridor to it if there is one, and the
+            remaining time, as plain values for JSON.
+        """
+        goal = self.judge.goal
+        trial = self.trial
+        users = trial.protocol.users
+        user = users.index(site) if site in users else None
+        target_m = goal.find_target_m(t_s, user)
+        fields: Json = {
+            "target": {"site": trial.slave, "at": target_m.tolist(), "width_m": goal.width_m}
+        }
+        corridor = goal.find_corridor(t_s)
+        if corridor is not None:
+            start_m, width_m = corridor
+            fields["way"] = {"from": start_m.tolist(), "width_m": width_m}
+        fields["appeared"] = t_s >= goal.appears_s
+        # The time of a trial runs from the appearance of the target.
+        running_s = max(t_s, goal.appears_s)
+        fields["left_s"] = max(0.0, trial.longest_s - running_s)
+        return fields
+
+
+@dataclass
+class _StepRequest:
+    """A step that the users are asked to complete now, such as a questionnaire.
+
+    Attributes:
+        step: The step.
+        from_ns: Time from which replies are accepted, in ns on the monotonic clock. The users
+            rest until then.
+        replies: For each user who has completed the step, by name of the site, the answers and
+            the number of the page that sent them.
+    """
+
+    step: Step
+    from_ns: int = 0
+    replies: dict[str, tuple[dict[str, float | None], int]] = field(default_factory=dict)
+
+
+class Stage:
+    """Decides what the web pages of an experiment show before, during and after each trial.
+
+    In an experiment, people move robot arms over a network. Each trial is a session of its own.
+    Between trials, the participants complete steps on their pages, such as a questionnaire. The
+    program that conducts the experiment calls `request_step` and `show_trial`. The server of
+    the pages runs in another thread. It calls `describe` for the content of a page, `accept`
+    for a reply of a participant, and `poll` regularly.
+
+    Args:
+        plan: Plan of the experiment.
+        clock: Clock of this process.
+
+    Attributes:
+        users: Names of the sites (processes, one per arm) whose arms the participants hold.
+        shows_ages: True if the pages first show how old the displayed poses of the other arms
+            are. It is False in a staircase, a procedure that asks participants for differences,
+            because the ages could reveal the answer.
+    """
+
+    def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
+        self.users = plan.protocol.users
+        self._plan = plan
+        self._clock = clock
+        self.shows_ages = plan.protocol.staircase is None
+        self._request: _StepRequest | None = None
+        self._watch: TrialWatch | None = None
+        self._step: Step | None = None
+        self._phase = "checking"
+        self._feedback: Json = {"why": "", "measures": {}}
+        self._holders: dict[str, int] = {}
+        self._page_seen_ns: dict[str, int] = {}
+
+    def request_step(
+        self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()
+    ) -> _StepRequest:
+        """Asks the users on their pages to complete a step, such as a questionnaire.
+
+        Args:
+            step: The step.
+            rest_s: Time that the users must rest before the step, in s.
+            done: Sites of the users who have completed the step already.
+
+        Returns:
+            The request, in which the replies of the users are collected.
+        """
+        rest_end_ns = self._clock.monotonic_ns() + int(rest_s * NS_PER_S)
+        request = _StepRequest(step, rest_end_ns)
+        request.replies |= {site: ({}, 0) for site in done}
+        self._step = step
+        self._watch = None
+        self._phase = step.kind
+        self._request = request
+        return request
+
+    def show_trial(self, watch: TrialWatch) -> None:
+        """Shows the pages that the session of a trial is about to begin.
+
+        Args:
+            watch: Object that judges the trial while its session runs.
+        """
+        self._request = None
+        self._watch = watch
+        self._phase = "starting"
+
+    def show_checking(self) -> None:
+        """Shows that a trial has ended and its log is being checked."""
+        self._watch = None
+        self._phase = "checking"
+
+    def show_feedback(self, entry: TrialEntry | None, why: str = "") -> None:
+        """Shows the participants the result of a trial, or why the trial must be repeated.
+
+        Args:
+            entry: Result of the trial. None if it must be repeated.
+            why: Reason for the repetition.
+        """
+        self._feedback = {"why": why, "measures": {}}
+        names = self._plan.protocol.feedback
+        if entry is not None and names:
+            measures = {name: entry.measures[name] for name in names if name in entry.measures}
+            self._feedback["measures"] = measures
+            self._feedback["succeeded"] = entry.succeeded
+
+    def show_end(self) -> None:
+        """Shows that the experiment has ended."""
+        self._request = None
+        self._step = None
+        self._phase = "over"
+
+    def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
+        """Evaluates the new records of a trial, and notes which users have an open page.
+
+        The server of the pages calls this method many times a second.
+
+        Args:
+            view: Present state of the session.
+            pages: For each open page of a user, the name of the user's site and the number of
+                the page.
+
+        Returns:
+            Texts that the log should keep as marks of this moment. Empty if no trial is
+            running.
+        """
+        now_ns = self._clock.monotonic_ns()
+        request = self._request
+
+        # The first page of a site has the smallest number. Only this page counts.
+        self._holders = {}
+        for site, number in pages:
+            self._holders[site] = min(number, self._holders.get(site, number))
+        self._page_seen_ns |= dict.fromkeys(self._holders, now_ns)
+
+        if request is not None and request.step.kind == "trial":
+            # A user who leaves is not ready any more.
+            for site, (_, page) in list(request.replies.items()):
+                if self._holders.get(site) != page:
+                    del request.replies[site]
+
+        if self._watch is None:
+            return []
+        if view.running and self._phase == "starting":
+            self._phase = "trial"
+        absent: list[str] = []
+        for site in self.users:
+            absence_ns = now_ns - self._page_seen_ns.get(site, now_ns)
+            if absence_ns > MAX_ABSENCE_NS:
+                absent.append(site)
+        return self._watch.poll(view, absent)
+
+    def accept(self, site: str, page: int, message: StageMessage) -> bool:
+        """Processes a message of a page, such as the answers to a questionnaire.
+
+        Args:
+            site: Name of the user's site. Empty for an experimenter.
+            page: Number of the page that sent the message.
+            message: The message.
+
+        Returns:
+            False if the message was not requested from that page. It has no effect then.
+        """
+        is_holder = self._holders.get(site) == page
+        if isinstance(message, AbortTrial):
+            is_allowed = is_holder or not site
+            return is_allowed and self._abort_trial(site, message.why)
+        request = self._request
+        if request is None or self._clock.monotonic_ns() < request.from_ns:
+            return False
+        if not is_holder or message.key != request.step.key:
+            return False
+        form = request.step.form
+        try:
+            answers = form.read(message.answers) if form else {}
+        except UsageError:
+            return False
+        request.replies[site] = (answers, page)
+        return True
+
+    def _abort_trial(self, site: str, why: str) -> bool:
+        """Aborts the running trial. Returns False if no trial runs."""
+        watch = self._watch
+        if watch is None or watch.over:
+            return False
+        reason = f": {why}" if why else ""
+        watch.aborted = f"{site or 'the experimenter'} stopped it{reason}"
+        return True
+
+    def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
+        """Describes for a page what it must show of the experiment now.
+
+        Args:
+            role: Role of the page: that of an experimenter, a user or a watcher.
+            site: Name of the site of the page's user. Empty if the page belongs to no user.
+            page: Number of the page.
+            t_s: Time of the pose that the page shows, in s. None if it shows no arms.
+
+        Returns:
+            The present phase, the requested step, the task, the users and further facts that
+            the role may see, as plain values for JSON.
+        """
+        step = self._step
+        request = self._request
+        watch = self._watch
+        protocol = self._plan.protocol
+        fields: Json = {
+            "phase": self._phase,
+            "title": protocol.title or protocol.name,
+            "told": self._feedback,
+        }
+        if step is None:
+            return fields
+        planned = step.planned
+        # The experiment's thread may end the request at any time.
+        done_sites = () if request is None else tuple(request.replies)
+        slave = self._plan.scenarios[planned.condition].slave
+        fields |= {
+            "key": step.key,
+            "users": self._describe_users(step, done_sites),
+            "task": protocol.task.render_instructions(slave),
+            "trial": planned.trial,
+            "trials": self._plan.trials[-1].trial,
+            "block": planned.block,
+            "blocks": len(protocol.conditions),
+            "practice": planned.practice,
+        }
+        if request is not None:
+            rest_ns = request.from_ns - self._clock.monotonic_ns()
+            fields["rest_s"] = max(0.0, rest_ns / NS_PER_S)
+        if watch is not None and t_s is not None:
+            fields |= watch.describe(t_s, site)
+        if role == "experimenter":
+            fields |= self._describe_for_experimenter(step)
+        if role == "user" and site in self.users:
+            fields |= self._describe_for_user(step, site, page)
+            fields["done"] = site in done_sites
+        return fields
+
+    def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
+        """Describes the users: pseudonym, and whether they are present or done.
+
+        Args:
+            step: The step.
+            done_sites: Sites of the users who have completed the step.
+        """
+        users: list[Json] = []
+        for site, pseudonym in zip(self.users, step.planned.group, strict=True):
+            state = "here" if site in self._holders else ""
+            if site in done_sites:
+                state = "done"
+            users.append({"site": site, "who": pseudonym, "state": state})
+        return users
+
+    def _describe_for_experimenter(self, step: Step) -> Json:
+        """Returns the fields that only experimenters may see, such as the condition."""
+        planned = step.planned
+        condition = planned.condition
+        if planned.phase:
+            condition += f", {planned.phase}"
+        elif planned.catch:
+            condition += ", a catch trial"
+        return {
+            "number": planned.number,
+            "of": len(self._plan.trials),
+            "condition": condition,
+        }
+
+    def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
+        """Returns the fields for the page of a user, such as the questionnaire.
+
+        The field "second" tells that another page of the same site counts.
+        """
+        pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
+        fields: Json = {
+            "who": pseudonyms[site],
+            "second": self._holders.get(site) != page,
+        }
+        if step.kind == "consent":
+            fields["text"] = self._plan.protocol.consent
+        if step.form is not None:
+            form = msgspec.to_builtins(step.form)
+            fields["form"] = {**form, "forced": step.form.is_forced}
+        return fields

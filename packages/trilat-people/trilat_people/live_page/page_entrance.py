@@ -1,0 +1,121 @@
+"""Limits the number of connections that the server of the web pages keeps open.
+
+People watch and control the robot arms of a session on web pages. A new connection is called a
+stranger until the server knows the role of its user: experimenter, user of one arm, or watcher.
+Then the connection is called a page. The server limits the number of strangers and the number
+of pages, so that nobody can keep others out by opening many connections.
+
+Invariant:
+    - Silent or slow connections and downloads count as strangers. If there are too many
+      strangers, the oldest one is closed for a new connection.
+    - The number of pages is limited for each role separately, so that many watchers do not take
+      the places of other roles.
+    - A new page of an experimenter or a user is always accepted. If there are too many, the
+      oldest page with the same role is closed. A page on which an experimenter controls the
+      session is closed only if all experimenters' pages control it.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Protocol, TypeVar
+
+from websockets.asyncio.server import ServerConnection
+
+from .page_orders import Role
+
+MAX_STRANGERS = 64
+"""Largest number of open connections without a role."""
+MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
+"""Largest number of open pages of a role; for users, at each site."""
+
+
+class Strangers:
+    """The open connections for which it is not known yet what they want.
+
+    Their number is limited. If there are too many, the oldest is closed, so that nobody can
+    keep others out with many silent connections.
+
+    Args:
+        refused: Numbers of refusals by reason. Connections that are closed here are added.
+    """
+
+    def __init__(self, refused: Counter[str]) -> None:
+        # The keys of a dictionary keep their order: the oldest connection is first.
+        self._connections: dict[ServerConnection, None] = {}
+        self._refused = refused
+
+    def add(self, connection: ServerConnection) -> None:
+        """Adds a new connection, and closes the oldest connection if there are too many."""
+        if len(self._connections) >= MAX_STRANGERS:
+            oldest = next(iter(self._connections))
+            self.remove(oldest)
+            self._refused["too many connections"] += 1
+            oldest.transport.abort()
+        self._connections[connection] = None
+
+    def remove(self, connection: ServerConnection) -> None:
+        """Removes a connection that was closed, or that has become a page with a known role."""
+        self._connections.pop(connection, None)
+
+
+class _SeatedPage(Protocol):
+    """Describes the fields of an open web page by which the server limits the number of pages.
+
+    The class `page_server.Page` has these fields.
+
+    Attributes:
+        role: Role of the person at the page: experimenter, user of one arm, or watcher.
+        number: Number of the page. A page that was opened later has a larger number.
+        takes_part: True if the person may move arms and change settings of the session.
+    """
+
+    role: Role
+    number: int
+    takes_part: bool
+
+
+Page = TypeVar("Page", bound=_SeatedPage)
+
+
+def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
+    """Finds out whether there are as many open pages of a role as allowed.
+
+    Args:
+        pages: The open pages of all roles.
+        role: The role whose pages are counted.
+    """
+    role_pages = _list_pages_of_role(pages, role)
+    return len(role_pages) >= MAX_PAGES[role.kind]
+
+
+def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
+    """Chooses the open page that must be closed so that another page of a role can be opened.
+
+    Args:
+        pages: The open pages of all roles.
+        role: Role of the new page.
+
+    Returns:
+        The page to close. None if there is room for the new page.
+    """
+    role_pages = _list_pages_of_role(pages, role)
+    if len(role_pages) < MAX_PAGES[role.kind]:
+        return None
+
+    oldest_first = sorted(role_pages, key=lambda page: page.number)
+    if role.kind == "experimenter":
+        # A page that takes part may hold an arm. It is closed only if all pages take part.
+        for page in oldest_first:
+            if not page.takes_part:
+                return page
+    return oldest_first[0]
+
+
+def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
+    """Lists the pages of a role. For a user, these are the pages of users of the same site."""
+    role_pages: list[Page] = []
+    for page in pages:
+        is_same_site = page.role.site == role.site
+        if page.role.kind == role.kind and (role.kind != "user" or is_same_site):
+            role_pages.append(page)
+    return role_pages

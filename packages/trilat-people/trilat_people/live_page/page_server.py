@@ -1,0 +1,1118 @@
+"""Serves the web page of a session: its files over HTTP, and its data over a WebSocket.
+
+A session is a run in which several processes ("sites") each control one robot arm. A page shows
+the arms while they move. Depending on its role it may also hold an arm, change the delay of
+links, or stop the arms. The server sends frames, which describe the present state, and receives
+messages of the page. It reads the messages that the sites exchange, as a recorder does.
+
+The server runs in a thread of its own. The session neither waits for the server nor needs it:
+if the server fails, the session continues. In an experiment with people, the server shows one
+session after the other, and a `Stage` controls the steps around them. If the machine has a
+browser, the server opens it.
+
+Invariant:
+    - A page receives a frame only when it has drawn an earlier one. A slow page therefore sees
+      fewer frames, and nobody waits for it. Each frame has the newest state.
+    - Requests from pages of another web site, requests without a token, and messages that are
+      too many, too large or not allowed for the page's role are refused and counted. None of
+      their contents reaches a site.
+    - The number of pages of each role is limited, see `page_entrance`.
+    - One thread serves all pages and receives the session's messages. Therefore no locks are
+      needed.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+import ssl
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import msgspec
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed, InvalidMessage
+from websockets.http11 import Request, Response
+
+from trilat_net.errors import UsageError, WireError, count_nouns
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_member_keys
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.process import raise_priority
+
+from .page_entrance import Strangers, choose_page_to_close, is_full
+from .page_files import PageFiles
+from .page_opening import BrowserOpening
+from .page_orders import (
+    MAX_MESSAGE_BYTES,
+    AnswerPage,
+    EndSession,
+    MarkMoment,
+    MessageLimits,
+    MoveHand,
+    OrderDesk,
+    PageHands,
+    PageMessage,
+    ReleaseArms,
+    Role,
+    RoleLinks,
+    Seen,
+    SetLink,
+    SetShares,
+    ShowAges,
+    StageMessage,
+    StopArms,
+    TakePart,
+    read_page_message,
+)
+from .session_frames import SessionFrames, render_event
+from .session_view import SessionView
+
+# The libraries of experiments are loaded for experiments only.
+if TYPE_CHECKING:
+    from .experiment_stage import Stage
+
+NICE = -5
+"""Priority of the page's threads, and of the threads that deliver the page's messages.
+
+The priority is above the normal priority, and below that of the sites.
+"""
+FRAMES_PER_S = 30
+"""Rate of the frames, in 1/s."""
+FRAMES_AHEAD = 2
+"""Largest number of frames that a page has not drawn yet: one travels while one is drawn."""
+MAX_EXCESS = 1_000
+"""Number of messages beyond the allowed rate after which a page is closed."""
+REQUEST_TIMEOUT_S = 3.0
+"""Longest wait for the encryption of a connection, and again for its request, in s."""
+ANSWER_TIMEOUT_NS = 10_000_000_000
+"""Time for a page that holds an arm to answer whether another page may take part, in ns."""
+RESTART_S = 1.0
+"""Time between a failure of the server and its restart, in s."""
+SWITCH_POLL_NS = 10_000_000
+"""Time between two checks whether another session is shown, in ns."""
+WAITING_FRAME_STEP = 10
+"""Number of frame periods between two frames before a session begins."""
+POINTS_PER_FRAME = 240
+"""Largest number of points of the plots in a frame. A page that was away longer has a gap."""
+_POLICY_VIOLATION = 1008
+"""Code with which the server closes a socket (RFC 6455)."""
+_BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
+"""Codes with which the library closes a socket (RFC 6455), and reasons for the counts."""
+_SILENT = logging.getLogger("trilat.page")
+_SILENT.addHandler(logging.NullHandler())
+_SILENT.propagate = False
+"""Logger of the WebSocket library. It prints nothing, because strangers could flood it."""
+
+RESULTS_TIMEOUT_NS = 600_000_000_000
+"""Longest time for which an open page can load the report and the log, in ns."""
+MAX_DURATION_S = 3600.0
+"""Longest duration of a session with a page, in s, unless the user sets another duration."""
+
+_NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+class _Visitor(ServerConnection):
+    """Connection of a browser to the server, from its beginning until it is closed.
+
+    Any program can connect. Data that are not a valid request of a browser are counted, and
+    answered with the HTTP status 400.
+
+    Attributes:
+        refused: Numbers of refused connections and messages, by reason.
+        strangers: Connections that are open but do not belong to a web page yet.
+    """
+
+    refused: Counter[str]
+    strangers: Strangers
+    _has_received = False
+    _is_counted = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Adds a new connection to the connections that do not belong to a web page yet.
+
+        Args:
+            transport: The connection.
+        """
+        super().connection_made(transport)
+        self.strangers.add(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Notes that the connection was closed.
+
+        Args:
+            exc: Reason why it was closed. None if it was closed in order.
+        """
+        self.strangers.remove(self)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Processes data of the browser, and notes that this connection has sent some.
+
+        Browsers open connections in advance and close some of them unused. The note
+        distinguishes these from connections whose data were not a valid request.
+
+        Args:
+            data: The received bytes.
+        """
+        # Browsers open connections in advance and close some unused; those are not counted.
+        self._has_received = True
+        super().data_received(data)
+
+    def send_data(self) -> None:
+        """Sends the waiting data to the browser.
+
+        Browsers talk to the server over a WebSocket. If the browser's data were not a valid
+        request to open one, the connection is first counted as refused. If the data were not
+        even HTTP, the reply has the HTTP status 400.
+        """
+        problem = self.protocol.handshake_exc
+        if problem is not None and self._has_received and not self._is_counted:
+            self._is_counted = True
+            self.refused["malformed request"] += 1
+            if self.request is None and isinstance(problem, InvalidMessage):
+                self.transport.write(_NO_HTTP)
+        super().send_data()
+
+
+class Page:
+    """State of one page that is open in a browser: its rights, and what was sent to it.
+
+    The server sends frames, messages from which the page draws the session. A frame describes
+    the present state. Therefore a slow page may miss some frames.
+
+    Attributes:
+        connection: WebSocket connection to the page.
+        number: Number of the page. Pages are counted from 1.
+        role: Rights of the page's user, and the site whose user's view the page shows.
+        hands: Connections with which the page holds and moves arms.
+        takes_part: True if the page may give orders.
+        asks: The other pages that must allow this page to take part, and the time of its
+            request in ns. None if the page has not requested it.
+        wake: Event that is set when there is a frame that the page has not received.
+        drawn: Number of the last frame that the page has drawn.
+        sent: Number of the last frame that was sent to the page.
+        notified: Number of the frame that was sent before the last one.
+        unseen: Numbers of the frames that were sent but not drawn yet.
+        points: Number of points of the plots that the page has received.
+        energies: Number of points of the energy plot that the page has received.
+        events: Number of events that the page has received.
+        greeted: True if the page has received the description of the running session.
+        limits: Limits of the page's message rates.
+        excess: Number of messages that exceeded the common limit of all kinds of messages.
+    """
+
+    def __init__(
+        self,
+        connection: ServerConnection,
+        number: int,
+        role: Role,
+        hands: PageHands,
+        *,
+        takes_part: bool,
+    ) -> None:
+        self.connection = connection
+        self.number = number
+        self.role = role
+        self.hands = hands
+        self.takes_part = takes_part
+        self.asks: tuple[set[Page], int] | None = None
+        self.wake = asyncio.Event()
+        self.drawn = 0
+        self.sent = 0
+        self.notified = 0
+        self.unseen: deque[int] = deque()
+        self.points = 0
+        self.energies = 0
+        self.events = 0
+        self.greeted = False
+        self.limits = MessageLimits()
+        self.excess = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PageOptions:
+    """Command-line options that determine how the page of a session is served.
+
+    Attributes:
+        host: Address at which the server listens.
+        port: Port at which the server listens. 0 chooses any free port.
+        insecure: True if the user allows an address outside this machine without encryption.
+        opens: True to open a browser, if there is one.
+        tls: Folder with the keys of a member of the session, which are used for encryption.
+            None for no encryption.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    insecure: bool = False
+    opens: bool = True
+    tls: Path | None = None
+
+    def make_context(self) -> ssl.SSLContext | None:
+        """Returns the TLS settings with which the server encrypts its connections to browsers.
+
+        Returns:
+            The settings, with the certificate and the private key from the folder `tls`. None
+            if the connections are not encrypted.
+
+        Raises:
+            UsageError: The keys cannot be used, for example because they have expired.
+        """
+        if self.tls is None:
+            return None
+        # Keys that have expired, or that other users can read, are refused.
+        read_member_keys(self.tls)
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(self.tls / CERTIFICATE, self.tls / PRIVATE_KEY)
+        return context
+
+    def check(self) -> None:
+        """Checks that the server can listen at the address, and that the user accepts its risk.
+
+        An address outside this machine must be encrypted, or declared as `insecure`.
+
+        Raises:
+            UsageError: The address is in use, or neither encrypted nor declared as insecure.
+        """
+        if self.make_context() is None and self.host not in HERE and not self.insecure:
+            raise UsageError(
+                f"--host {self.host}: anyone who can listen on this network can read the "
+                "token of the page and take part; give the keys of a member with --tls, "
+                "give --insecure if you trust everybody on this network, or leave out "
+                "--host and use an SSH tunnel"
+            )
+        try:
+            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+            socket.create_server((self.host, self.port), family=family).close()
+        except OSError as error:
+            raise UsageError(
+                f"{self.host}:{self.port}: cannot listen: {error.strerror}"
+            ) from None
+
+
+class PageServer:
+    """Serves the page of a session while a `with` statement runs.
+
+    Entering the statement starts the server and opens a browser.
+
+    Args:
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        options: How the page is served.
+        ends: True if experimenters may end the session from their page.
+        say: Function that prints a line for the user.
+        stage: The steps of an experiment with people. None if there is no experiment.
+
+    Attributes:
+        address: Link for an experimenter, with its token.
+        end_requested: Event that is set when a page has requested the end of the session.
+        files: Files that are sent over HTTP.
+        refused: Numbers of refused messages and requests, by reason.
+        view: Present state of the session.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        options: PageOptions = PageOptions(),
+        *,
+        ends: bool = False,
+        say: Callable[[str], None] = lambda _: None,
+        stage: "Stage | None" = None,
+    ) -> None:
+        self._clock = clock
+        self._ends = ends
+        self._say = say
+        self._stage = stage
+        self._host = options.host
+        self._port = options.port
+        self._tls = options.make_context()
+        self._scheme = "http" if self._tls is None else "https"
+        self._pages: set[Page] = set()
+        self.refused: Counter[str] = Counter()
+        self._next_session: tuple[Bus, str] | None = None
+        self._switch_session(bus, session)
+        self._is_local = options.host in HERE
+        self._opens = options.opens
+        self._links = RoleLinks()
+        self._links_are_printed = False
+        self.files = PageFiles()
+        self._shows_ages = stage is None or stage.shows_ages
+        self._page_count = 0
+        self._frame_number = 0
+        self.end_requested = threading.Event()
+        self.address = ""
+        self._opening = BrowserOpening("")
+        self._closing: set[asyncio.Task[None]] = set()
+        self._ready = threading.Event()
+        self._problem: OSError | None = None
+        self._ending = threading.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stop: asyncio.Event | None = None
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+
+    def __enter__(self) -> "PageServer":
+        """Starts the server, prints its link and opens a browser.
+
+        Raises:
+            UsageError: The server cannot listen at its address.
+        """
+        self._thread.start()
+        self._ready.wait()
+        if self._problem is not None:
+            raise UsageError(
+                f"{self._host}:{self._port}: cannot listen: {self._problem.strerror}"
+            )
+        self._say(f"experimenter: {self.address}")
+        if self._opens and sys.stdout.isatty() and _has_screen():
+            self._opening = BrowserOpening(self.address)
+            self._opening.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Ends the server. Waits at most five seconds for its thread."""
+        self._ending.set()
+        if self._loop is not None and self._stop is not None:
+            # The loop of the server may have ended already.
+            with suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(5.0)
+        self._opening.remove_file()
+
+    def show(self, bus: Bus, session: str) -> None:
+        """Shows another session from now on.
+
+        This method waits until the server's thread no longer uses the bus of the previous
+        session, so that the caller may close it.
+
+        Args:
+            bus: Network connection that reaches the session.
+            session: Name of the session.
+        """
+        self._next_session = bus, session
+        while self._next_session is not None and self._thread.is_alive():
+            self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
+
+    def _switch_session_if_requested(self) -> None:
+        """Switches to the session of the last call of `show`, in the server's thread."""
+        if self._next_session is not None:
+            bus, session = self._next_session
+            try:
+                self._switch_session(bus, session)
+            finally:
+                self._next_session = None
+
+    def _switch_session(self, bus: Bus, session: str) -> None:
+        """Observes another session, and makes all pages receive its state from the beginning.
+
+        A page remembers how many points of the plots and how many events it has received, so
+        that it is sent only new ones. These numbers restart at 0 for the new session, and each
+        page is sent the constants of the new session again ("greeted").
+
+        Args:
+            bus: Network connection that reaches the session.
+            session: Name of the session.
+        """
+        self._bus = bus
+        self.view = SessionView(bus, self._clock, session)
+        self._frames = SessionFrames(self.view)
+        # The counts of refused messages continue over all sessions.
+        self._desk = OrderDesk(bus, self._clock, session, self.refused)
+
+        # The newest frame, which is a message with the present state of the session. The second
+        # attribute holds the newest frames for the users of sites, by the name of the site.
+        self._frame: dict[str, Any] | None = None
+        self._frames_as_site: dict[str, dict[str, Any]] = {}
+        # Latest replies of the sites to orders of the pages.
+        self._notices: list[dict[str, Any]] = []
+
+        for page in self._pages:
+            page.hands = PageHands(bus, self._clock, session, f"page {page.number}")
+            page.points = 0
+            page.energies = 0
+            page.events = 0
+            page.greeted = False
+
+    def _run(self) -> None:
+        """Runs the server in its thread until the end, and restarts it after a failure.
+
+        A failure before the server was ready is kept for `__enter__`, which raises it.
+        """
+        raise_priority(NICE)
+        while not self._ending.is_set() and self._problem is None:
+            try:
+                asyncio.run(self._serve())
+            except Exception as error:
+                if self._ready.is_set():
+                    self._count_failure("server", error)
+                    self._ending.wait(RESTART_S)
+                elif isinstance(error, OSError):
+                    self._problem = error
+                else:
+                    self._problem = OSError(0, str(error))
+            self._ready.set()
+
+    def report_refusals(self) -> None:
+        """Prints for the user how many messages and requests were refused, with the reasons.
+
+        Prints nothing if there were none.
+        """
+        for reason, count in sorted((+self.refused).items()):
+            self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
+
+    def _count_failure(self, part: str, error: Exception) -> None:
+        """Counts a failure of the page, and prints the first failure of each kind.
+
+        Args:
+            part: Part of the page that failed.
+            error: The error.
+        """
+        reason = f"{part} failed: {type(error).__name__}"
+        self.refused[reason] += 1
+        if self.refused[reason] == 1:
+            # The terminal may have been closed.
+            with suppress(OSError, ValueError):
+                self._say(f"the page continues, though its {reason}: {error}")
+
+    async def _serve(self) -> None:
+        """Serves pages until the end is requested."""
+        self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
+        members = {"refused": self.refused, "strangers": Strangers(self.refused)}
+        timeouts: dict[str, Any] = {}
+        if self._tls is not None:
+            timeouts = {"ssl_handshake_timeout": REQUEST_TIMEOUT_S, "ssl_shutdown_timeout": 1.0}
+        server = await serve(
+            self._serve_page,
+            self._host,
+            self._port,
+            ssl=self._tls,
+            process_request=self._answer_http,
+            create_connection=type("Counted", (_Visitor,), members),
+            max_size=MAX_MESSAGE_BYTES,
+            max_queue=32,
+            compression=None,
+            ping_interval=5,
+            # Long, because the page of a busy machine is slow and not dead.
+            ping_timeout=30,
+            open_timeout=REQUEST_TIMEOUT_S,
+            close_timeout=1,
+            logger=_SILENT,
+            **timeouts,
+        )
+        async with server, asyncio.TaskGroup() as tasks:
+            self._pages.clear()
+            self._port = server.sockets[0].getsockname()[1]
+            self.address = self._links.link(self._base_address, Role())
+            self._ready.set()
+            ticking = tasks.create_task(self._tick())
+            await self._stop.wait()
+            ticking.cancel()
+
+    @property
+    def _base_address(self) -> str:
+        """Address of the page, without query and token."""
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"{self._scheme}://{host}:{self._port}/"
+
+    def _print_links(self) -> None:
+        """Prints the links for users and watchers, once the users are known."""
+        scenario = self.view.scenario
+        if self._links_are_printed or (scenario is None and self._stage is None):
+            return
+        self._links_are_printed = True
+        if self._stage is not None:
+            users = [*self._stage.users]
+        else:
+            sites = {} if scenario is None else scenario.sites
+            users = [name for name, spec in sites.items() if spec.role == "master"]
+        roles = [Role("user", site) for site in users]
+        for role in (*roles, Role("watcher")):
+            name = f"{role.kind} {role.site}".rstrip()
+            self._say(f"{name}: {self._links.link(self._base_address, role)}")
+
+    async def _tick(self) -> None:
+        """Receives the session's messages and makes a frame, thirty times a second.
+
+        If one step fails, the failure is counted and the other steps continue.
+        """
+        while True:
+            begun_ns = self._clock.monotonic_ns()
+            steps = (
+                self._desk.poll,
+                self.view.poll,
+                self._switch_session_if_requested,
+                self._poll_stage,
+                self._print_links,
+                self._settle_requests,
+                self._make_frame,
+            )
+            for step in steps:
+                try:
+                    step()
+                except Exception as error:
+                    self._count_failure(step.__qualname__, error)
+            for page in self._pages:
+                page.wake.set()
+            spent_s = (self._clock.monotonic_ns() - begun_ns) * 1e-9
+            await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
+
+    def _poll_stage(self) -> None:
+        """Lets the experiment judge the new records, and marks its moments in the log."""
+        if self._stage is None:
+            return
+        users = [
+            (page.role.site, page.number) for page in self._pages if page.role.kind == "user"
+        ]
+        for moment in self._stage.poll(self.view, users):
+            self._desk.mark(next(iter(self.view.sites)), moment)
+
+    def _make_frame(self) -> None:
+        """Makes the next frame, and collects the sites' replies to orders for the pages."""
+        self._frame_number += 1
+        for site, channel, is_accepted, text in self._desk.replies:
+            notice = {
+                "n": self._frame_number,
+                "site": site,
+                "of": channel,
+                "ok": is_accepted,
+                "text": text,
+            }
+            self._notices.append(notice)
+        self._desk.replies.clear()
+        del self._notices[:-20]
+        self._frame = self._frames.make_frame() or self._frame
+        self._frames_as_site.clear()
+
+    def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Returns the response to an HTTP request.
+
+        The library calls this function for each request, before it opens a WebSocket.
+
+        Returns:
+            The response with a file or an error. None to open a WebSocket.
+        """
+        try:
+            target = urlsplit(request.path)
+            problem = self._find_refusal(request, target.query)
+        except (ValueError, LookupError):
+            # The address is invalid, or the request has two hosts.
+            self.refused["malformed request"] += 1
+            return connection.respond(HTTPStatus.BAD_REQUEST, "malformed request\n")
+        if problem is not None:
+            self.refused[problem] += 1
+            return connection.respond(HTTPStatus.FORBIDDEN, problem + "\n")
+        if target.path == "/socket":
+            role = self._links.find(target.query)
+            if role is not None and role.kind == "watcher" and is_full(self._pages, role):
+                self.refused["too many watchers"] += 1
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many watchers\n")
+            return None
+        response = self.files.find(target.path)
+        return response or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
+
+    def _find_refusal(self, request: Request, query: str) -> str | None:
+        """Returns the reason why a request must be refused. Returns None if it is accepted.
+
+        Args:
+            request: The request.
+            query: Query of its address, with the token.
+        """
+        host = request.headers.get("Host", "")
+        name = urlsplit(f"//{host}").hostname or ""
+        # The name of another web site may resolve to this machine (DNS rebinding).
+        if self._is_local and name not in HERE:
+            return "foreign host"
+        origin = request.headers.get("Origin")
+        if origin is not None and origin != f"{self._scheme}://{host}":
+            return "foreign origin"
+        if urlsplit(request.path).path == "/socket" and self._links.find(query) is None:
+            return "no token"
+        return None
+
+    async def _serve_page(self, connection: ServerConnection) -> None:
+        """Serves one page until its connection ends.
+
+        A page of a user takes part at once. A page of an experimenter does so if no other page
+        of an experimenter takes part.
+        """
+        assert connection.request is not None
+        role = self._links.find(urlsplit(connection.request.path).query)
+        assert role is not None, "a request without a role has been refused"
+        self._page_count += 1
+        hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._page_count}")
+
+        takes_part = role.kind == "user"
+        if role.kind == "experimenter":
+            takes_part = not any(other.takes_part for other in self.experimenters)
+        page = Page(connection, self._page_count, role, hands, takes_part=takes_part)
+
+        self._close_page_for(role)
+        self._pages.add(page)
+        if isinstance(connection, _Visitor):
+            connection.strangers.remove(connection)
+        if role.kind == "experimenter":
+            self._opening.remove_file()
+        sending = asyncio.create_task(self._send(page))
+        try:
+            async for text in connection:
+                self._receive(page, text)
+                # Further messages of the page are not even read.
+                if page.excess > MAX_EXCESS:
+                    await connection.close(_POLICY_VIOLATION, "too many messages")
+                    break
+        except ConnectionClosed as closed:
+            if closed.sent is not None and closed.sent.code in _BROKEN:
+                self.refused[_BROKEN[closed.sent.code]] += 1
+        finally:
+            page.hands.release()
+            sending.cancel()
+            self._pages.discard(page)
+
+    def _close_page_for(self, role: Role) -> None:
+        """Closes an older page if there are too many pages of a role for a new one."""
+        page = choose_page_to_close(self._pages, role)
+        if page is None:
+            return
+        self._pages.discard(page)
+        page.takes_part = False
+        page.hands.release()
+        self.refused[f"too many pages of {role.kind}s"] += 1
+        close = page.connection.close(_POLICY_VIOLATION, "a newer page took its place")
+        task = asyncio.get_running_loop().create_task(close)
+        self._closing.add(task)
+        task.add_done_callback(self._closing.discard)
+
+    def _receive(self, page: Page, text: str | bytes) -> None:
+        """Decodes and handles a message of a page, unless the page sends too many.
+
+        A message that releases an arm is always handled, because holding the arm could be
+        dangerous.
+        """
+        now_ns = self._clock.monotonic_ns()
+        if not page.limits.allows(PageMessage, now_ns):
+            page.excess += 1
+            self.refused["too many"] += 1
+            return
+        try:
+            message = read_page_message(text)
+            is_release = isinstance(message, MoveHand) and not message.grip
+            if is_release or page.limits.allows(type(message), now_ns):
+                self._handle_message(page, message)
+            else:
+                self.refused[f"too many: {type(message).__struct_config__.tag}"] += 1
+        except WireError as error:
+            self.refused[error.reason] += 1
+        except Exception as error:
+            self._count_failure("message", error)
+
+    def _handle_message(self, page: Page, message: PageMessage) -> None:
+        """Carries out the request of a page's message, if the page may request it.
+
+        A request that the page may not make is counted as refused, with the reason. The rights
+        depend on the role of the page's user, for example a watcher. Most requests are carried
+        out only for a page that takes part in the control of the session.
+
+        Args:
+            page: The page.
+            message: The decoded message.
+        """
+        if not page.role.may(message):
+            self.refused["not of its role"] += 1
+        # Requests of every page, whether it takes part or not.
+        elif isinstance(message, Seen):
+            self._note_drawn_frame(page, message.n)
+        elif isinstance(message, StopArms):
+            self._desk.stop(self.view.sites, page.role.noun)
+        elif isinstance(message, TakePart):
+            self._request_part(page, message.want)
+        elif isinstance(message, AnswerPage):
+            self._answer_request(page, message)
+        elif not page.takes_part:
+            self.refused["does not take part"] += 1
+        else:
+            self._control_session(page, message)
+
+    def _note_drawn_frame(self, page: Page, frame_number: int) -> None:
+        """Notes that a page has drawn a frame, so that further frames can be sent to it.
+
+        Args:
+            page: The page.
+            frame_number: Number of the frame, as the page states it.
+        """
+        page.drawn = min(frame_number, page.sent)  # a page may state any number
+        while page.unseen and page.unseen[0] <= page.drawn:
+            page.unseen.popleft()
+        page.wake.set()
+
+    def _control_session(self, page: Page, message: PageMessage) -> None:
+        """Carries out a request that only a page that takes part in the session may make.
+
+        Args:
+            page: The page, which takes part.
+            message: The decoded message, which the role of the page's user permits.
+        """
+        view = self.view
+        if isinstance(message, SetLink | SetShares):
+            self._desk.queue_change(message, view.sites, view.links, page.role.noun)
+        elif isinstance(message, ReleaseArms):
+            self._desk.release(message, view.sites, page.role.noun)
+        elif isinstance(message, MarkMoment):
+            if view.scenario is not None:
+                self._desk.mark(view.scenario.names[0], message.text)
+        elif isinstance(message, ShowAges):
+            self._shows_ages = message.shown
+        elif isinstance(message, MoveHand):
+            site = view.sites.get(message.site)
+            if site is None or site.hand is None:
+                self.refused["nobody can hold it"] += 1
+            else:
+                page.hands.move(message, pushes=site.hand.mode == "force")
+        elif isinstance(message, StageMessage):
+            site_name = page.role.site
+            stage = self._stage
+            if stage is None or not stage.accept(site_name, page.number, message):
+                self.refused["was not asked"] += 1
+        elif isinstance(message, EndSession) and self._ends:
+            self.end_requested.set()
+
+    def _request_part(self, page: Page, want: bool) -> None:
+        """Handles a page's request to take part, or to take part no longer.
+
+        If other pages hold an arm, the page takes part only if they agree.
+
+        Args:
+            page: The page.
+            want: True to take part.
+        """
+        if not want:
+            page.takes_part = False
+            page.asks = None
+            page.hands.release()
+        elif not page.takes_part and page.asks is None:
+            others = self.experimenters - {page}
+            holders = {other for other in others if self._list_held_sites(other)}
+            page.asks = (holders, self._clock.monotonic_ns()) if holders else None
+            page.takes_part = not holders
+
+    @property
+    def experimenters(self) -> set[Page]:
+        """The open pages of experimenters, who may control the session."""
+        return {page for page in set(self._pages) if page.role.kind == "experimenter"}
+
+    def _answer_request(self, page: Page, answer: AnswerPage) -> None:
+        """Applies the answer of a page to another page's request to take part."""
+        for other in self._pages:
+            if other.number == answer.page and other.asks is not None and page in other.asks[0]:
+                other.takes_part = answer.yes
+                other.asks = None
+                return
+        self.refused["was not asked"] += 1
+
+    def _settle_requests(self) -> None:
+        """Decides on requests to take part that nobody has answered in time.
+
+        The page may take part if the asked pages have gone, or if the time is over and they no
+        longer hold an arm.
+        """
+        now_ns = self._clock.monotonic_ns()
+        for page in self._pages:
+            if page.asks is None:
+                continue
+            asked_pages, asked_ns = page.asks
+            remaining = asked_pages & self._pages
+            is_too_late = now_ns - asked_ns > ANSWER_TIMEOUT_NS
+            if not remaining or is_too_late:
+                page.takes_part = not any(map(self._list_held_sites, remaining))
+                page.asks = None
+
+    def _list_held_sites(self, page: Page) -> list[str]:
+        """Lists the sites whose arms a page holds, according to the newest frame."""
+        sites = (self._frame or {}).get("sites", {})
+        held_sites: list[str] = []
+        for name, site in sites.items():
+            if page.hands.holds(name, site.get("source", 0)):
+                held_sites.append(name)
+        return held_sites
+
+    async def _send(self, page: Page) -> None:
+        """Sends a page the newest frame, each time the page has drawn an earlier frame."""
+        encode: Callable[[Any], bytes] = msgspec.json.encode
+        with suppress(ConnectionClosed):
+            while True:
+                await page.wake.wait()
+                page.wake.clear()
+                has_begun = self._frame is not None
+                if not self._is_frame_due(page, has_begun=has_begun):
+                    continue
+                scenario = self.view.scenario
+                if scenario is not None and page.role.site not in ("", *scenario.names):
+                    return await page.connection.close(
+                        _POLICY_VIOLATION, "the session has no such site"
+                    )
+                page.notified = page.sent
+                page.sent = self._frame_number
+                page.unseen.append(page.sent)
+                try:
+                    if page.greeted and has_begun:
+                        message = self._describe_frame(page)
+                    else:
+                        message = self._describe_greeting(page)
+                    payload = encode(message)
+                except Exception as error:
+                    self._count_failure("frame", error)
+                    continue
+                page.greeted = has_begun
+                await page.connection.send(payload, text=True)
+
+    def _is_frame_due(self, page: Page, *, has_begun: bool) -> bool:
+        """Returns True if the page should receive the newest frame now.
+
+        Args:
+            page: The page.
+            has_begun: False before the session has a frame. Then pages receive a message only
+                now and then.
+        """
+        if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._frame_number:
+            return False
+        if has_begun or not page.sent:
+            return True
+        return self._frame_number - page.sent >= WAITING_FRAME_STEP
+
+    def _describe_greeting(self, page: Page) -> dict[str, Any]:
+        """Returns the first message to a page, with the constants of the session.
+
+        The message has the single key "hello". Its value contains the constants, the role of
+        the page's user ("role"), the site whose user's view the page shows ("as", empty for the
+        view of all sites), the number of the present frame ("n"), whether the page may end the
+        session ("ends"), and the step of the experiment if there is one.
+        """
+        role = page.role
+        frames = self._frames
+        # The user of a site must not see constants that reveal the condition of an experiment.
+        is_view_of_one_site = bool(role.site)
+        if is_view_of_one_site:
+            constants = frames.describe_session_as_user()
+        else:
+            constants = frames.describe()
+        may_end_session = self._ends and role.kind == "experimenter"
+        fields = {
+            **constants,
+            "role": role.kind,
+            "as": role.site,
+            "n": self._frame_number,
+            "ends": may_end_session,
+            **self._describe_stage(page),
+        }
+        return {"hello": fields}
+
+    def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
+        """Returns the present step of the experiment for a page. Empty without an experiment.
+
+        Args:
+            page: The page.
+            t_s: Time of the arms on the page, in s. None without arms.
+        """
+        if self._stage is None:
+            return {}
+        role = page.role
+        return {"stage": self._stage.describe(role.kind, role.site, page.number, t_s)}
+
+    def _describe_frame(self, page: Page) -> dict[str, Any]:
+        """Returns the newest frame for a page: the state of the session and of the page itself.
+
+        Args:
+            page: The page.
+
+        Returns:
+            The frame as plain values for JSON. It consists of the time, the arms and the links
+            as the page's user sees them, of the fields that are explained below, and of the
+            step of the experiment if there is one.
+        """
+        site = page.role.site
+        # The user of a site sees the other arms delayed. Other roles see all arms at present.
+        state = self._describe_as_site(site) if site else self._describe_all(page)
+        # The default role is that of an experimenter who sees all sites.
+        is_full_experimenter = page.role == Role()
+        return {
+            # Number of the frame, which the page sends back once it has drawn the frame.
+            "n": self._frame_number,
+            **state,
+            # Files of the ended session that can be loaded, and new replies of sites to orders.
+            "results": list(self.files.results) if is_full_experimenter else [],
+            "notices": self._list_notices(page),
+            # Whether the page shows how old the poses of the other arms are.
+            "ages": self._shows_ages,
+            # Number of open pages.
+            "pages": len(self._pages),
+            # Whether this page may give orders, whether it waits for the permission of other
+            # pages to do so, and the numbers of the pages that wait for its own permission.
+            "takes_part": page.takes_part,
+            "asks": page.asks is not None,
+            "asked": self._list_requests(page),
+            # Names of the sites whose arms this page holds.
+            "holds": self._list_held_sites(page),
+            # Number of refused messages and requests of all pages.
+            "refused": sum(self.refused.values()),
+            # "t" is the time of the arms in the frame, in s.
+            **self._describe_stage(page, state["t"]),
+        }
+
+    def _list_requests(self, page: Page) -> list[int]:
+        """Lists the numbers of the pages that ask this page whether they may take part."""
+        numbers: list[int] = []
+        for other in self._pages:
+            if other.asks is not None:
+                asked_pages, _ = other.asks
+                if page in asked_pages:
+                    numbers.append(other.number)
+        return numbers
+
+    def _list_notices(self, page: Page) -> list[dict[str, Any]]:
+        """Lists the replies of sites that a page has not received yet.
+
+        The replies name keys and commands, which only an experimenter can use. Pages of other
+        roles receive only which sites refused to stop.
+        """
+        notices = [notice for notice in self._notices if notice["n"] > page.notified]
+        if page.role.kind == "experimenter":
+            return notices
+        refused_stops: list[dict[str, Any]] = []
+        for notice in notices:
+            if notice["of"] == topics.STOP and not notice["ok"]:
+                text = f"{notice['site']} was not stopped"
+                refused_stops.append({**notice, "text": text})
+        return refused_stops
+
+    def _describe_as_site(self, site: str) -> dict[str, Any]:
+        """Returns the frame for the user of a site, who sees the other arms delayed."""
+        if site not in self._frames_as_site:
+            assert self._frame is not None
+            self._frames_as_site[site] = self._frames.describe_as(
+                self._frame, site, ages=self._shows_ages
+            )
+        return {**self._frames_as_site[site], "points": [], "energies": [], "events": []}
+
+    def _describe_all(self, page: Page) -> dict[str, Any]:
+        """Returns the frame for a page that sees everything, with new points and events.
+
+        The first frame of a page has all points that are kept.
+        """
+        frames = self._frames
+        view = self.view
+        is_first = page.points == 0 and page.energies == 0
+        # More than all points that are kept.
+        limit = 100_000 if is_first else POINTS_PER_FRAME
+        points = frames.points.since(page.points, limit)
+        energies = frames.energies.since(page.energies, limit)
+        events = [render_event(event) for event in view.events.since(page.events, 100)]
+        page.points = frames.points.count
+        page.energies = frames.energies.count
+        page.events = view.events.count
+        return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
+
+
+def _has_screen() -> bool:
+    """Returns True if this machine can show a browser."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+class PageAttendant(ExitStack):
+    """Serves the page of a session that runs in this process, such as one of `trilat live`.
+
+    The page is served while a `with` statement runs. It stays open after the session, so that
+    it can show the report.
+
+    Args:
+        options: How the page is served.
+        clock: Clock of this process.
+    """
+
+    def __init__(self, options: PageOptions, clock: Clock) -> None:
+        super().__init__()
+        self._options = options
+        self._clock = clock
+        self._page: PageServer | None = None
+
+    @contextmanager
+    def attend(
+        self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
+    ) -> Iterator[Callable[[], bool]]:
+        """Serves the web page of a session while the session runs, as a context manager.
+
+        The function that runs the session, such as `run_demo`, accepts this method as its
+        `SessionAttendant`, the function that watches the session and may end it.
+
+        Args:
+            session: Name of the session.
+            endpoints: Network addresses at which the session can be reached.
+            say: Function that prints a line for the user.
+
+        Yields:
+            A function that returns True once a page has requested the end of the session.
+        """
+        bus = self.enter_context(closing(ZenohBus([], endpoints)))
+        page = PageServer(bus, self._clock, session, self._options, ends=True, say=say)
+        self._page = self.enter_context(page)
+        yield self._page.end_requested.is_set
+        self._page.report_refusals()
+
+    def offer_results(self, paths: Iterable[Path]) -> None:
+        """Offers files of the ended session to experimenters, as long as their page is open.
+
+        Ctrl-C ends the offer. The address of a file cannot be guessed, and only these pages
+        receive it.
+
+        Args:
+            paths: The files, such as the report and the log.
+        """
+        page = self._page
+        clock = self._clock
+        assert page is not None, "`attend` has been called"
+        # The processes of the session have ended.
+        page.view.finish()
+        page.files.add_results(paths)
+        give_up_ns = clock.monotonic_ns() + RESULTS_TIMEOUT_NS
+        with suppress(KeyboardInterrupt):
+            while page.experimenters and clock.monotonic_ns() < give_up_ns:
+                clock.sleep_until(clock.monotonic_ns() + RESULTS_TIMEOUT_NS // 3000)
+
+
+@contextmanager
+def show_on_page(
+    options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
+) -> Iterator[tuple[SessionView, Callable[[], None]]]:
+    """Serves a web page that shows a session of other processes, as a context manager.
+
+    The command `trilat watch --page` uses it as the argument `show` of `watch_session`.
+
+    Args:
+        options: How the page is served.
+        clock: Clock of this process.
+        session: Name of the session.
+        say: Function that prints a line for the user.
+        bus: Network connection that reaches the session.
+
+    Yields:
+        The state of the session, and a function to update the display. This function does
+        nothing, because the server updates the page by itself.
+    """
+    with PageServer(bus, clock, session, options, say=say) as page:
+        yield page.view, lambda: None
+        page.report_refusals()

@@ -1,0 +1,756 @@
+"""Composes the JSON messages from which the web pages of a running session are drawn.
+
+A session is a run in which several processes ("sites") each control one robot arm. A record
+contains what a site measured and computed in one tick, a period of its control loop. A page
+first receives the constants of the session, such as the shapes of the arms. Then it receives
+about 30 frames a second. A frame is a message with the present state of each arm and network
+link, and with new points of the plots.
+
+Invariant:
+    - A frame is computed from the records since the previous frame. It describes the whole
+      state. Therefore a page may miss frames.
+    - The plots show the extremes of the records between two frames, so that short peaks are
+      visible.
+    - Forces act on the arm and are in N. The forces of people and of the control law follow
+      from their torques: torque = J^T force, where J is the Jacobian of the end effector. Near
+      a singular pose, the force is the smallest one that explains the torque.
+    - The frame for the user of one site shows every other arm as that user sees it: with the
+      delay of the network, and with the further delay of the picture if the scenario has one
+      (`SessionView.find_peer_ticks`). It contains no newer pose of these arms.
+"""
+
+import math
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from trilat_net.analysis.aligned import AlignedRecords
+from trilat_net.analysis.arm_rows import (
+    EndEffectorRows,
+    build_arm_rows,
+    joint_positions_m,
+    upright_axes,
+)
+from trilat_net.analysis.body_turns import BodyTurns
+from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
+from trilat_net.core.life.live_hand import HandInForce
+from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
+from trilat_net.core.step.vectors import Array
+from trilat_net.net.messages import Event
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.event_text import describe_event
+from trilat_net.scenario.laws import identify_law
+
+from .session_view import SessionView, SiteView, Tail
+
+POINTS_KEPT = 1200
+"""Points of a plot that a new page receives: 40 s."""
+ENERGY_PERIOD_S = 0.025
+"""Smallest time between two points of the energies, in s."""
+COLOURS = 6
+"""Number of colours for sites in `theme.css`."""
+MAX_FRAME_S = 0.5
+"""Longest time whose records a frame evaluates, in s."""
+_MIN_SINGULAR_SHARE = 0.05
+"""Smallest singular value of the Jacobian that is inverted, as a share of the largest.
+
+Along directions in which the end effector moves less, the force counts as zero.
+"""
+
+Json = dict[str, Any]
+"""A JSON object."""
+
+
+def _round(values: Array, digits: int = 5) -> list[Any]:
+    """Returns an array as nested lists of rounded numbers."""
+    rounded: list[Any] = np.round(values, digits).tolist()
+    return rounded
+
+
+class _ArmFrames:
+    """Composes the parts of a page's messages that describe one arm: shape, pose and forces.
+
+    Args:
+        scenario: Scenario of the session.
+        site: Name of the site that runs the arm.
+    """
+
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        self._scenario = scenario
+        self._site = site
+        self._model = scenario.arms[site]
+        self._spec = scenario.sites[site]
+        self._walls = list_walls(self._spec)
+        self._hand = self._spec.find_live_hand()
+        limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
+        joint_count = self._model.counts.joints
+        self._tau_limit = np.broadcast_to(limits_nm, (joint_count,))
+        self._rows = build_arm_rows(scenario, site)
+
+    def describe(self) -> Json:
+        """Describes what does not change during the session, so that a page can draw the arm.
+
+        Returns:
+            Role, colour, joints, walls, limits and further constants of the arm, as plain
+            values for JSON.
+        """
+        model = self._model
+        spec = self._spec
+        colours = self._scenario.assign_colours(COLOURS)
+        site_number = self._scenario.names.index(self._site)
+        colour = colours[site_number % len(colours)]
+        up = None
+        if model.chain is not None:
+            up_axes = upright_axes(model.chain)
+            up = _round(up_axes)
+        q0 = np.array([spec.q0_rad], dtype=np.float64)
+        start_m = joint_positions_m(model, q0)[0]
+        link_vectors_m = np.diff(start_m, axis=0)
+        link_lengths_m = np.linalg.norm(link_vectors_m, axis=1)
+        reach_m = float(link_lengths_m.sum())
+        body_sizes_m = self._scenario.bodies_m(self._site).values()
+        walls: list[Json] = []
+        for wall in self._walls:
+            point_m = list(wall.a)
+            normal = list(wall.b)
+            walls.append({"at": point_m, "normal": normal})
+        return {
+            "role": spec.role,
+            "colour": colour,
+            "rate_hz": spec.rate_hz,
+            "planar": model.chain is None,
+            "up": up,
+            "joints": len(spec.q0_rad),
+            "start": _round(start_m),
+            "reach": reach_m,
+            "tau_limit": _round(self._tau_limit),
+            "bodies": [list(size) for size in body_sizes_m],
+            "walls": walls,
+            "task": model.shares_pose,
+            "unit": "m" if model.shares_pose else "rad",
+            "hand": self._describe_hand(),
+            "stops": spec.on_stale.action == "glide",
+            "law": identify_law(spec.control),
+        }
+
+    def _describe_hand(self) -> Json | None:
+        """Returns how people can hold the arm. Returns None if nobody can hold it."""
+        hand = self._hand
+        if hand is None:
+            return None
+        device = hand.device
+        axis_count = self._model.counts.axes
+        centre, _, outer_m, *_ = self._model.reach
+        # JSON has no infinity.
+        longest_m = outer_m if outer_m < math.inf else None
+        return {
+            "mode": hand.mode,
+            "limit": hand.actor.limit,
+            "device": {
+                "rows": device.rows(axis_count),
+                "scale": device.scale,
+                "jump_m_s": device.jump_m_s,
+            },
+            "reach": {
+                "centre": list(centre),
+                "most": longest_m,
+            },
+        }
+
+    def describe_pose(self, q: Array) -> Json:
+        """Computes where the joints of the arm are, for a page that draws it.
+
+        Args:
+            q: Positions of the joints, shape (n,), in rad or m.
+
+        Returns:
+            The points between the links of the arm in m, and the joint positions, as plain
+            values for JSON.
+        """
+        rows = q[np.newaxis]
+        points_m = joint_positions_m(self._model, rows)[0]
+        return {
+            "points": _round(points_m),
+            "q": _round(q),
+        }
+
+    def describe_start(self) -> Json:
+        """Computes where the joints of the arm are before the first tick of the session.
+
+        Returns:
+            The pose as `describe_pose` returns it, with the tick -1 and no bodies.
+        """
+        q0 = np.array(self._spec.q0_rad, dtype=np.float64)
+        pose = self.describe_pose(q0)
+        return {
+            **pose,
+            "tick": -1,
+            "bodies": [],
+        }
+
+    def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
+        """Describes the present state of the arm, and the peaks since the previous frame.
+
+        A frame is a message from which a page draws the session, about 30 times a second. The
+        largest values are plotted, so that peaks between two frames are visible.
+
+        Args:
+            records: Records since the previous frame. The last one is the present.
+
+        Returns:
+            The present state as plain values for JSON, and four largest values: norm of the
+            synchronisation error, torque of a joint in N m, force of people in N, and force of
+            the walls in N.
+        """
+        split = split_torque(records, self._scenario)
+        hand_force = self._compute_hand_force(records, split)
+        wall_force_n = self._compute_wall_force(records, split)
+        error_norm = np.linalg.norm(records.e, axis=1)
+        torque_size = np.abs(records.tau)
+        full_torque = self._tau_limit * (1.0 - 1e-12)
+        is_at_limit = torque_size >= full_torque
+        present_pose = self.describe_pose(records.q[-1])
+        reference_m = self._place_reference(records)
+        present_torque = records.tau[-1]
+        present_hand_force = hand_force[-1]
+        present_grip = self._describe_grip(records, present_hand_force)
+        state = {
+            **present_pose,
+            "ghost": _round(reference_m),
+            "e": float(error_norm[-1]),
+            "tau": _round(present_torque, 3),
+            "clamped": bool(is_at_limit.any()),
+            "hand": _round(present_hand_force, 3),
+            "pull": self._compute_pull(records, split),
+            "wall": _round(wall_force_n[-1], 3),
+            **present_grip,
+        }
+        hand_force_size = np.linalg.norm(hand_force, axis=1)
+        wall_force_size = np.linalg.norm(wall_force_n, axis=1)
+        extremes = [
+            float(error_norm.max()),
+            float(torque_size.max()),
+            float(hand_force_size.max()),
+            float(wall_force_size.max()),
+        ]
+        return state, extremes
+
+    def _place_reference(self, records: AlignedRecords) -> Array:
+        """Computes where the reference is that the arm follows, so that a page can draw it.
+
+        The reference `q_des` is what the control law makes the arm follow. It consists of joint
+        positions, or of a pose of the end effector if the sites exchange such poses. A pose
+        begins with the position x, y, z, multiplied by the scale of the site's task.
+
+        Args:
+            records: Records since the previous frame. The reference of the last one is placed.
+
+        Returns:
+            Points in m. For joint positions, the points between the links of an arm in the
+            reference pose. For a pose of the end effector, one point, shape (1, 3).
+        """
+        points_m: Array
+        if self._model.shares_pose:
+            scaled_position = records.q_des[-1, :3]
+            points_m = scaled_position[np.newaxis] / self._spec.task.scale
+        else:
+            last_row = len(records.known) - 1  # `known` has one entry per record
+            last_reference = records.q_des[last_row:]  # shape (1, n), in rad or m
+            points_m = joint_positions_m(self._model, last_reference)[0]
+        return points_m
+
+    def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
+        """Returns who holds the arm in the last record, and how. Empty if nobody can hold it.
+
+        Args:
+            records: Records since the previous frame.
+            force: Force of people in the last record, in N.
+        """
+        if not records.hand.size:
+            return {}
+        last_values = records.hand[-1].tolist()
+        grip = HandInForce.read(last_values)
+        hand = self._hand
+        is_limited = False
+        if hand is not None and hand.mode != "joint" and grip.source:
+            force_size_n = float(np.linalg.norm(force))
+            limit_n = grip.grip * hand.force_limit_n
+            is_limited = force_size_n >= limit_n * (1.0 - 1e-6)
+        pulls_tip = hand is not None and hand.mode == "tip"
+        has_target = pulls_tip and grip.grip > 0.0
+        target = grip.target if has_target else None
+        return {
+            "grip": grip.grip,
+            "source": grip.source,
+            "target": target,
+            "hand_limited": is_limited,
+        }
+
+    def _compute_hand_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
+        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), in N."""
+        torque = split.operator
+        if not self._spec.hands:
+            # Without a hand in the scenario, a tiny torque is a rounding error of the split.
+            largest_external_nm = np.abs(records.tau_x).max()
+            rounding_nm = 1e-9 * (1.0 + largest_external_nm)
+            largest_torque_nm = np.abs(torque).max()
+            if largest_torque_nm < rounding_nm:
+                return np.zeros_like(split.end_effector.position)
+        return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
+
+    def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
+        """Returns the force of the control law that a user feels in the last record, in N.
+
+        The force follows from the law's torque without gravity compensation.
+
+        Returns:
+            The components of the force. Empty if the masses of the arm are not known.
+        """
+        if not self._spec.arm.known:
+            return []
+        motion = split.end_effector
+        last_motion = EndEffectorRows(
+            position=motion.position[-1:],
+            speed=motion.speed[-1:],
+            J=motion.J[-1:],
+        )
+        last_q = records.q[-1:]
+        gravity_torque = self._rows.gravity_torque(last_q)
+        law_torque = records.tau[-1:] - gravity_torque
+        forces = last_motion.find_force(law_torque, _MIN_SINGULAR_SHARE)
+        last_force = forces[0]
+        return _round(last_force, 3)
+
+    def _compute_wall_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
+        """Returns the force of all walls at the end effector, shape (K, 2) or (K, 3), in N."""
+        total = np.zeros_like(split.end_effector.position)
+        for wall in self._walls:
+            size_n = wall_force(wall, records.nominal_s, split.end_effector)
+            normal = np.array(wall.b)
+            total = total + size_n[:, np.newaxis] * normal
+        return total
+
+
+class SessionFrames:
+    """Composes the messages from which web pages draw a running session.
+
+    About 30 times a second, a page receives a frame: a message with the present state of all
+    arms and network links.
+
+    Args:
+        view: Present state of the session.
+
+    Attributes:
+        points: Points of the plots over time. Each point is a list of values, and `describe`
+            states their names.
+        energies: Points of the energy plot: time in s, energy function V of the stability proof
+            in J, and energy that people and walls have supplied in J. V must not rise by more
+            than the supplied energy.
+    """
+
+    def __init__(self, view: SessionView) -> None:
+        self._view = view
+        self._arms: dict[str, _ArmFrames] = {}
+        self._arm_constants: Json = {}
+        # The newest tick of each site in the previous frame.
+        self._last_ticks: dict[str, int] = {}
+        self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
+        self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
+        self._energy_s = -1.0
+        # By the user's site and the peer; a site's own arm is turned under the user "".
+        self._peer_poses: dict[tuple[str, str], Json] = {}
+        self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
+
+    def describe(self) -> Json:
+        """Describes what does not change during the session, for a page that draws it.
+
+        Returns:
+            The sites, the links and the names of the plotted values, as plain values for JSON.
+            Before the session runs, the members that are present and those that are missing.
+        """
+        view = self._view
+        scenario = view.scenario
+        # Prepared before the session runs, because loading the compiled arms takes seconds.
+        if scenario is not None and not self._arms:
+            arms: dict[str, _ArmFrames] = {}
+            for site in scenario.names:
+                arms[site] = _ArmFrames(scenario, site)
+            self._arms = arms
+            for site, arm in self._arms.items():
+                self._arm_constants[site] = arm.describe()
+        if scenario is None or not view.running:
+            return self._describe_waiting(scenario)
+        columns: list[str] = []
+        for site in scenario.names:
+            columns += [f"{site}.{kind}" for kind in ("e", "tau", "hand", "wall")]
+        columns += [f"{link}.age" for link in scenario.links]
+        link_ends: dict[str, list[str]] = {}
+        for link in scenario.links:
+            link_ends[link] = link.split("->")
+        shares: Json = {}
+        for site in scenario.names:
+            shares[site] = scenario.dominance[site]
+        return {
+            "running": True,
+            "session": view.session,
+            "name": scenario.name,
+            "title": scenario.title or scenario.name,
+            "about": scenario.about,
+            "duration_s": scenario.duration_s,
+            "sites": self._arm_constants,
+            "links": link_ends,
+            "shares": shares,
+            "columns": columns,
+        }
+
+    def _describe_waiting(self, scenario: Scenario | None) -> Json:
+        """Returns the members of a session that has not begun."""
+        members = self._view.members
+        names = [] if scenario is None else scenario.names
+        missing = [name for name in names if name not in members]
+        return {
+            "session": self._view.session,
+            "running": False,
+            "title": "",
+            "here": sorted(members),
+            "missing": missing,
+        }
+
+    def make_frame(self) -> Json | None:
+        """Composes the frame of this moment from the records since the previous frame.
+
+        The new points are also added to the plots `points` and `energies`.
+
+        Returns:
+            The present state of all arms and links, as plain values for JSON. None until every
+            site has published a record.
+        """
+        view = self._view
+        has_all_records = all(site.record is not None for site in view.sites.values())
+        if not view.running or not has_all_records:
+            return None
+        if not self._arms:
+            self.describe()
+
+        sites: Json = {}
+        point: list[float | None] = []
+        t_s = 0.0
+        for name, site in view.sites.items():
+            sites[name], extremes = self._describe_site(name, site)
+            t_s = max(t_s, sites[name]["t"])
+            point += extremes
+        links = {name: self._describe_link(name) for name in view.links}
+        point += [link["age_ms"] for link in links.values()]
+        has_new_records = any(site["new"] for site in sites.values())
+        if has_new_records:
+            self._add_point(t_s, point)
+        self._add_energies()
+        energy_problem = ""
+        if view.energy is not None:
+            energy_problem = view.energy.reason
+        silence_s = 0.0
+        if not view.ended:
+            silence_s = round(view.session_silence_s, 1)
+        return {
+            "t": t_s,
+            "sites": sites,
+            "links": links,
+            "shares": view.dominance,
+            "energy": energy_problem,
+            "ended": view.ended,
+            "silent_s": silence_s,
+            "dropped": sum(view.dropped.values()),
+        }
+
+    def _add_point(self, t_s: float, values: list[float | None]) -> None:
+        """Adds a point to the plots, with values of five digits."""
+        point: list[float | None] = [round(t_s, 4)]
+        for value in values:
+            rounded = None if value is None else float(f"{value:.5g}")
+            point.append(rounded)
+        self.points.add(point)
+
+    def _add_energies(self) -> None:
+        """Adds points to the energy plot, at most one per `ENERGY_PERIOD_S`."""
+        course = self._view.advance_energy()
+        if course is None:
+            return
+        columns = [column.tolist() for column in course]
+        for t_s, V, supplied in zip(*columns, strict=True):
+            next_point_s = self._energy_s + ENERGY_PERIOD_S
+            if t_s >= next_point_s - 1e-9:
+                self._energy_s = t_s
+                self.energies.add([t_s, V, supplied])
+
+    def describe_session_as_user(self) -> Json:
+        """Describes what does not change during the session, for the page of a participant.
+
+        The settings of links and the dominance factors, the weights with which the arms follow
+        each other, are left out. They could reveal the condition of an experiment.
+
+        Returns:
+            The remaining constants of `describe`.
+        """
+        constants = self.describe()
+        if not constants["running"]:
+            return constants
+        hidden: Json = {
+            "about": "",
+            "links": {},
+            "shares": {},
+            "columns": [],
+        }
+        return {**constants, **hidden}
+
+    def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
+        """Makes the frame for the user of one arm from the frame that shows all arms.
+
+        A frame is a message from which a web page draws the session. The user sees the other
+        arms with their delay, in the poses that the site (process) of the user's arm last knew.
+
+        Args:
+            frame: Newest frame of `make_frame`. It is not changed.
+            site: Name of the user's site.
+            ages: True to add how old the pose of each other arm is, in ms.
+
+        Returns:
+            The frame for this user.
+        """
+        local = frame["sites"][site]
+        ticks = self._view.find_peer_ticks(site, local["tick"], local["used"])
+        sites: Json = {}
+        for name in frame["sites"]:
+            if name not in ticks:
+                sites[name] = local
+                continue
+            peer = self._describe_peer(site, name, ticks[name])
+            if ages:
+                age_ms = self._compute_age_ms(name, peer["tick"], local["t"])
+                peer = {**peer, "age_ms": age_ms}
+            sites[name] = peer
+        return {
+            "t": local["t"],
+            "sites": sites,
+            "links": {},
+            "shares": {},
+            "energy": "",
+            "ended": frame["ended"],
+            "silent_s": local["silent_s"],
+        }
+
+    def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
+        """Returns the age of a site's record at a time, in ms.
+
+        Args:
+            site: Name of the site.
+            tick: Tick of the record. It is -1 before the first record.
+            t_s: The time, in s.
+
+        Returns:
+            The age. None before the first record.
+        """
+        if tick < 0:
+            return None
+        rate_hz = self._view.sites[site].window.rate_hz
+        record_ms = tick * 1e3 / rate_hz
+        age_ms: float = t_s * 1e3 - record_ms
+        return age_ms
+
+    def _describe_peer(self, site: str, peer: str, tick: int) -> Json:
+        """Returns the pose in which the user of a site sees the arm of a peer.
+
+        The pose is stored for the next frame: if the record of a tick is missing, the user sees
+        the pose of the previous frame again. Users of different sites see different poses,
+        because their delays differ. Therefore a pose is stored per site and peer.
+
+        Args:
+            site: Name of the user's site.
+            peer: Name of the site whose arm is described.
+            tick: Tick of the peer (period of its control loop) that the user sees.
+
+        Returns:
+            The pose as `_ArmFrames.describe_pose` returns it, its tick, and the poses of the
+            bodies that the arm can touch. Before the first record, the pose at the start.
+        """
+        arm = self._arms[peer]
+        pose = self._peer_poses.get((site, peer)) or arm.describe_start()
+        peer_view = self._view.sites[peer]
+        if tick != pose["tick"] and peer_view.window.has_record(tick):
+            records_of_tick = peer_view.window.rows(tick, tick)  # exactly one record
+            joint_pose = arm.describe_pose(records_of_tick.q[0])
+            body_poses = peer_view.bodies.get(tick, [])
+            # Chooses the signs of the bodies' quaternions, so that the picture does not jump.
+            aligned_bodies = self._turns[site, peer].align(body_poses)
+            pose = {
+                **joint_pose,
+                "tick": tick,
+                "bodies": _round(aligned_bodies),
+            }
+        self._peer_poses[site, peer] = pose
+        return pose
+
+    def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
+        """Describes the present state of one site and its arm, as a part of a frame.
+
+        Args:
+            name: Name of the site.
+            site: What is known about the site. It must have published a record.
+
+        Returns:
+            The state as plain values for JSON: that of `_ArmFrames.describe_now`, and the
+            fields that are explained below. In addition, the four largest values since the
+            previous frame, as `_ArmFrames.describe_now` returns them.
+        """
+        record = site.record
+        stats = site.stats
+        assert record is not None
+        state, extremes, has_new_records = self._describe_new_records(name, site)
+        has_ended = self._view.ended
+        alarm = None
+        silence_s = 0.0
+        if not has_ended:
+            alarm = site.find_alarm(self._view.session, name)
+            silence_s = round(self._view.silence_s(site), 1)
+        # Chooses the signs of the bodies' quaternions, so that the picture does not jump. The
+        # empty name stands for a page that sees all arms.
+        bodies = self._turns["", name].align(record.bodies)
+        # A view that joined late does not know how many earlier records are missing.
+        missing_count = 0
+        has_seen_all = site.first_tick == 0
+        if has_seen_all:
+            state_account = site.reception.accounts["state"]
+            missing_count = state_account.missing
+        # The source is the number of the program that holds the arm at present, 0 if none does.
+        is_held = bool(state.get("source"))
+        fields = {
+            **state,
+            # Whether records have arrived since the previous frame.
+            "new": has_new_records,
+            # Time in s and tick of the newest record.
+            "t": record.t_ns / NS_PER_S,
+            "tick": record.tick,
+            # For each peer, the tick of the sample that the control law used.
+            "used": record.used,
+            # What the site does, for example "fault".
+            "mode": record.mode,
+            # Poses of the bodies that the arm can touch: seven numbers per body.
+            "bodies": _round(bodies),
+            "alarm": None if alarm is None else _describe_alarm(alarm),
+            "ended": site.ended or has_ended,
+            # Time without a message of the site, in s.
+            "silent_s": silence_s,
+            # Person or program that holds the arm. Empty if nobody does.
+            "holder": site.holder if is_held else "",
+            # Largest lateness of a tick in us, and number of ticks that were a period late.
+            "late_us": stats.late_max_us if stats else 0,
+            "overruns": stats.overruns if stats else 0,
+            # Number of records that have not arrived.
+            "missing": missing_count,
+        }
+        return fields, extremes
+
+    def _describe_new_records(
+        self, name: str, site: SiteView
+    ) -> tuple[Json, list[float], bool]:
+        """Evaluates the records of a site since the previous frame.
+
+        Returns:
+            The state of the arm, the extremes, and whether there are new records. Without new
+            records, the newest record is evaluated again.
+        """
+        window = site.window
+        newest_tick = max(window.newest, 0)
+        previous_tick = self._last_ticks.get(name, -1)
+        self._last_ticks[name] = newest_tick
+        # After a pause, only the last `MAX_FRAME_S` are evaluated: a frame must be fast.
+        most_ticks = round(MAX_FRAME_S * window.rate_hz)
+        earliest_tick = newest_tick - most_ticks
+        next_tick = min(previous_tick + 1, newest_tick)
+        first_tick = max(next_tick, earliest_tick, window.first)
+        records = window.rows(first_tick, newest_tick)
+        state, extremes = self._arms[name].describe_now(records)
+        has_new_records = newest_tick > previous_tick
+        return state, extremes, has_new_records
+
+    def _describe_link(self, name: str) -> Json:
+        """Returns the present state of a link: age of samples, settings and counts."""
+        view = self._view
+        peer, _, receiver = name.partition("->")
+        receiving = view.sites[receiver]
+        sending = view.sites[peer]
+        record = receiving.record
+        used_tick = -1
+        age_ms = None
+        if record is not None:
+            used_tick = record.used.get(peer, -1)
+            if used_tick >= 0:
+                used_ms = used_tick * 1e3 / sending.window.rate_hz
+                age_ms = record.t_ns / 1e6 - used_ms
+        newest_tick = used_tick
+        if sending.record:
+            newest_tick = sending.record.tick
+        samples_under_way = 0
+        if used_tick >= 0:
+            newer_samples = min(newest_tick - used_tick, 100_000)
+            samples_under_way = max(0, newer_samples)
+        stated: Json = {}
+        for key, value in view.links[name].items():
+            if isinstance(value, str | int | float):
+                stated[key] = value
+        shares = view.dominance.get(receiver, {})
+        sample_counts = _count_samples(receiving, peer)
+        return {
+            "age_ms": age_ms,
+            "under_way": samples_under_way,
+            "stated": stated,
+            "share": shares.get(peer, 0.0),
+            **sample_counts,
+        }
+
+
+def _count_samples(receiving: SiteView, peer: str) -> Json:
+    """Returns delay and counts of a peer's samples. Empty before the first statistics."""
+    stats = receiving.stats
+    if stats is None:
+        return {}
+    return {
+        "delay_us": stats.delay_us.get(peer, -1),
+        "accepted": stats.accepted.get(peer, 0),
+        "late": stats.late.get(peer, 0),
+        "lost": stats.lost.get(peer, 0),
+    }
+
+
+def _describe_alarm(alarm: LifeAlarm) -> Json:
+    """Returns an alarm for a page.
+
+    The page has a button for the command that ends the alarm. Therefore the advice does not
+    name a shell command.
+    """
+    advice = alarm.before if alarm.order else alarm.advice
+    return {
+        "word": alarm.word,
+        "reason": alarm.reason,
+        "advice": advice,
+        "order": alarm.order,
+    }
+
+
+def render_event(event: Event) -> Json:
+    """Formats an event of the session for the list of events on a page.
+
+    Args:
+        event: The event.
+
+    Returns:
+        The parts of its line, as plain values for JSON.
+    """
+    t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
+    text = describe_event(event.kind, event.text, event.command)
+    return {
+        "t": t_s,
+        "member": event.member,
+        "kind": event.kind,
+        "text": text,
+    }

@@ -1,0 +1,45 @@
+"""The options of the commands that serve a page to browsers."""
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+
+from trilat_net.app.cli.options import flag, value
+
+
+class PageServing(NamedTuple):
+    """The options of a command that serves a page to browsers."""
+
+    host: Annotated[
+        str,
+        value(
+            "--host",
+            "ADDRESS",
+            "Address on which the page is served; any address other than loopback requires "
+            "--tls or --insecure.",
+        ),
+    ] = "127.0.0.1"
+    port: Annotated[
+        int,
+        typer.Option(
+            "--port",
+            min=0,
+            max=65535,
+            help="Port on which the page is served; 0 selects any free port.",
+        ),
+    ] = 0
+    insecure: Annotated[
+        bool, flag("--insecure", "Allow a --host other than loopback without encryption.")
+    ] = False
+    browser: Annotated[
+        bool,
+        flag(
+            "--browser/--no-browser",
+            "Open the page in a browser, if this machine has a browser.",
+        ),
+    ] = True
+    tls: Annotated[
+        Path | None,
+        value("--tls", "DIR", "Encrypt the page with the member's keys in this folder."),
+    ] = None

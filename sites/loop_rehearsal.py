@@ -1,0 +1,133 @@
+"""Runs the control loop of a single site without a network, to measure how late its ticks are.
+
+A tick is one period of the control loop. It is late if it begins after the time at which it was
+due. The loop does the same work as in a session, except that no messages are exchanged.
+"""
+
+from collections.abc import Sequence
+
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import NS_PER_S, Arrival, TickInput, TickRecord
+from trilat_net.net.clock import Clock
+from trilat_net.net.timing import LoopStats, SiteTiming
+from trilat_net.scenario import Scenario
+
+from .site_loop import PeerInbox, StateBlock, run_loop
+
+
+def rehearse_loop(scenario: Scenario, name: str, clock: Clock) -> list[int]:
+    """Executes all ticks of a site in real time, without other sites.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+        name: Name of the site.
+        clock: Clock of this process.
+
+    Returns:
+        The lateness of each tick, the time from its due time to its beginning, in us.
+    """
+    return _Rehearsal(scenario, name).run(clock)
+
+
+class _Rehearsal(LoopStats):
+    """Runs the control loop of a single site without a network, to measure how late ticks are.
+
+    The loop does the same work as in a session, except that no messages are exchanged. This
+    object takes the place of two objects of the loop: of its statistics, so that the lateness
+    of each tick can be stored, and of the `_LoopSite`, whose methods do nothing here.
+
+    A tick is one period of the control loop. It is late if it begins after the time at which it
+    was due.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+        name: Name of the site.
+    """
+
+    def __init__(self, scenario: Scenario, name: str) -> None:
+        self._site = Site(scenario.setup(name))
+        self._ticks = scenario.ticks(name)
+        super().__init__(self._site, 1)
+        self._late_us: list[int] = []
+
+    def run(self, clock: Clock) -> list[int]:
+        """Executes all ticks (periods of the control loop) of the scenario in real time.
+
+        The loop runs without other sites: there are no links to receive samples from, and the
+        records are not sent anywhere.
+
+        Args:
+            clock: Clock of this process.
+
+        Returns:
+            The lateness of each tick, the time from its due time to its beginning, in us.
+        """
+        boot = 1  # identifies the start of the process, which matters only in a network
+        inbox_without_peers = PeerInbox(
+            links=(), rings=(), boots=(), monitors=(), dropped=self.dropped
+        )
+        # The first tick is due a tenth of a second from now.
+        first_tick_ns = clock.monotonic_ns() + NS_PER_S // 10
+        timing = SiteTiming(first_tick_ns, self._site.rate_hz, peers=(), leader="")
+        discarded_records = StateBlock(self._site, boot, send=lambda _: None)
+
+        run_loop(
+            site=self._site,
+            boot=boot,
+            ticks=self._ticks,
+            clock=clock,
+            inbox=inbox_without_peers,
+            timing=timing,
+            stats=self,
+            states=discarded_records,
+            io=self,
+        )
+        return self._late_us
+
+    def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
+        """Adds one tick to the statistics, and stores its lateness.
+
+        The loop calls the method in place of `LoopStats.count_tick`.
+
+        Args:
+            late_us: Time by which the tick began late, in us.
+            busy_us: Computing time of the previous tick, in us.
+            skipped: Number of ticks (periods of the control loop) that were skipped before this
+                tick.
+        """
+        super().count_tick(late_us, busy_us, skipped)
+        self._late_us.append(late_us)
+
+    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
+        """Computes one tick of the site without samples from other sites, to test its timing.
+
+        A tick is one period of the control loop. The loop calls this method in place of
+        `_LoopSite.step`.
+
+        Args:
+            k: Number of the tick.
+            arrivals: Samples (states of other sites) that have arrived. Always empty in this
+                test.
+
+        Returns:
+            The record of the tick: what the site measured and computed.
+        """
+        return self._site.step(TickInput(k, arrivals))
+
+    def run_housekeeping(self, *_: object) -> bool:
+        """Does nothing, because this test of the control loop has no network.
+
+        The loop calls this method after a tick, in the place where a site of a session sends
+        and receives messages.
+
+        Returns:
+            False, so that the loop continues.
+        """
+        return False
+
+    # The other methods of `_LoopSite`.
+    publish_sample = run_housekeeping
+    publish_link = run_housekeeping
+    report_tick = run_housekeeping
+    should_stop = run_housekeeping
+    use_slack = run_housekeeping

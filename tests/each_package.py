@@ -1,0 +1,106 @@
+"""Runs the quick tests of each package where only the core and the package itself are installed.
+
+    python -m tests.each_package [NAME ...]
+
+Each package gets an environment of its own. The core and the package are installed there from wheels that are
+built of this clone. The libraries that the two require, those of the package's dependency group `test`, and those
+of `TEST_LIBRARIES`, are the locked ones of the environment that runs this, so that no network is needed. The tests run in a folder that has no source of the
+program: what they import is what is installed.
+"""
+
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+from .distributions import (
+    CORE,
+    PACKAGES,
+    ROOT,
+    bare_environment,
+    build,
+    install,
+    make_sources,
+    names_of,
+    run,
+)
+
+TEST_LIBRARIES = {"hypothesis", "playwright", "pytest", "pytest-timeout", "pytest-xdist"}
+"""What the tests of every package need beside the program, of the dependency group `dev`."""
+FOUND = """
+from importlib.util import find_spec
+print(*(name for name in {names} if find_spec(name) is not None))
+print(find_spec("trilat_net").origin)
+"""
+SOURCES = {"packages", "recorder", "sites", "trilat_net"}
+"""Folders at the top that the tests do not see."""
+
+
+def make_environment(name: str, sources: Path, folder: Path) -> Path:
+    """Makes an environment with the core, one package and the libraries of tests; returns its folder."""
+    clean = folder / "clean"
+    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=folder)
+    for distribution in (CORE, name):
+        built = folder / distribution
+        built.mkdir()
+        stated = tomllib.loads(
+            (sources / distribution / "pyproject.toml").read_text(encoding="utf-8")
+        )
+        libraries = names_of(stated["project"]["dependencies"]) - {CORE}
+        install(clean, build(sources / distribution, built)[1], libraries)
+    of_tests = stated.get("dependency-groups", {}).get("test", [])
+    install(clean, None, TEST_LIBRARIES | names_of(of_tests))
+    return clean
+
+
+def make_tree(name: str, folder: Path) -> Path:
+    """Makes a folder that looks like this clone to the tests of one package, without any source."""
+    tree = folder / "tree"
+    tests = tree / "packages" / name / "tests"
+    tests.parent.mkdir(parents=True)
+    tests.symlink_to(ROOT / "packages" / name / "tests")
+    listed = run("git", "ls-tree", "--name-only", "HEAD", cwd=ROOT).split()
+    for top in set(listed) - SOURCES:
+        (tree / top).symlink_to(ROOT / top)
+    return tree
+
+
+def run_tests(name: str, sources: Path) -> int:
+    """Runs the quick tests of a package; returns the exit code of pytest."""
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        clean = make_environment(name, sources, folder)
+        tree = make_tree(name, folder)
+        modules = [package.replace("-", "_") for package in PACKAGES]
+        code = FOUND.format(names=modules)
+        found, origin = run(clean / "bin" / "python", "-c", code, cwd=tree).splitlines()
+        assert found == name.replace("-", "_"), found
+        assert Path(origin).is_relative_to(clean), origin
+        tests = f"packages/{name}/tests"
+        settings = [
+            "-o",
+            f"pythonpath={tests}",
+            "-p",
+            "no:cacheprovider",
+            "-p",
+            "tests.conftest",
+        ]
+        words = ["-q", "-n", "auto", *settings, "-m", "not live and not long", tests]
+        return subprocess.run(
+            [clean / "bin" / "python", "-m", "pytest", *words], cwd=tree, env=bare_environment()
+        ).returncode
+
+
+def main() -> None:
+    """Runs the tests of the packages that the command line names, or of all."""
+    names = sys.argv[1:] or PACKAGES
+    with tempfile.TemporaryDirectory() as folder:
+        sources = make_sources(Path(folder) / "sources")
+        failed = [name for name in names if run_tests(name, sources)]
+    print("all pass alone" if not failed else f"these fail alone: {', '.join(failed)}")
+    sys.exit(bool(failed))
+
+
+if __name__ == "__main__":
+    main()

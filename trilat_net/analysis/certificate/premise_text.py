@@ -1,0 +1,332 @@
+"""Writes the sentences about the premises of a stability certificate.
+
+A premise is a condition of the stability theorem, such as constant delays. `premises` computes
+its quantities, and the functions in `DESCRIBERS` state them for people. A site is the process
+that runs one arm.
+
+Invariant:
+    - A sentence lists at most `MAX_LISTED_NAMES` sites, links or joints, and counts the others.
+    - Each class of `premise_quantities` has one function here, in `DESCRIBERS`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ...errors import count_nouns
+from .premise_quantities import (
+    AxisQuantities,
+    BookedTorqueQuantities,
+    BooksQuantities,
+    DelayQuantities,
+    DominanceQuantities,
+    FollowingQuantities,
+    FunctionalObstacle,
+    GainQuantities,
+    LawQuantities,
+    MissingFunctional,
+    OperatorQuantities,
+    ParameterFault,
+    ParameterQuantities,
+    PresenceQuantities,
+    PresentStretch,
+    RecordQuantities,
+    SamplingQuantities,
+    SingularPoseQuantities,
+    StopQuantities,
+    TorqueQuantities,
+    WallQuantities,
+)
+
+MAX_LISTED_NAMES = 4
+"""Largest number of links or sites that a sentence names."""
+_OBSTACLES = {
+    FunctionalObstacle.UNKNOWN_PARAMETERS: "theta of the arm is unknown, and V depends on it",
+    FunctionalObstacle.LAW: "law {law} has no functional V",
+    FunctionalObstacle.ORIENTATIONS: (
+        "the arm follows orientations, for which ed is not the derivative of e, "
+        "so dV/dt has terms of either sign"
+    ),
+}
+_PARAMETER_FAULTS = {
+    ParameterFault.OUTSIDE_BOX: "theta is outside the box in which the law keeps its estimates",
+    ParameterFault.NEVER_LEARNT: "a parameter is neither learnt nor known",
+    ParameterFault.FRICTION: "the law does not compensate all friction of the joints",
+}
+
+
+def describe_missing_functionals(missing: Sequence[MissingFunctional]) -> str:
+    """Explains for which arms the energy function of the stability proof does not exist.
+
+    Args:
+        missing: Sites of these arms, grouped by the reason.
+
+    Returns:
+        The names of the sites and the reasons, separated by semicolons. Empty if the energy
+        exists for every arm.
+    """
+    return "; ".join(
+        f"{', '.join(group.sites)}: {_OBSTACLES[group.obstacle].format(law=group.law)}"
+        for group in missing
+    )
+
+
+def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
+    """Returns a sentence that the total energy of all arms is not defined, and why.
+
+    The total energy weights each site, the process that runs one arm. If no group of sites
+    follows another group, the weights of the groups relative to each other are arbitrary.
+
+    Args:
+        groups: Names of the sites in each group. They follow each other and no site outside the
+            group.
+    """
+    group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
+    return (
+        f"{group_texts} follow nobody outside: beta is not unique, certify each group by itself"
+    )
+
+
+def _describe_law(quantities: LawQuantities) -> str:
+    if quantities.missing:
+        return describe_missing_functionals(quantities.missing)
+    return "adaptive at every site, of arms whose theta is known"
+
+
+def _describe_parameters(quantities: ParameterQuantities) -> str:
+    if not quantities.faults:
+        return "every parameter is learnt or known, and no box excludes it"
+    return _join_limited(
+        [f"{site}: {_PARAMETER_FAULTS[fault]}" for site, fault in quantities.faults]
+    )
+
+
+def _describe_gains(quantities: GainQuantities) -> str:
+    if quantities.scales is None:
+        rows = []
+        for site, gains in quantities.Kd.items():
+            values = ", ".join(f"{gain:g}" for gain in gains)
+            rows.append(f"{site} ({values})")
+        return f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
+    if not quantities.is_positive:
+        return "some Kd is zero, but the theorem requires positive Kd"
+    if len(set(quantities.scales.values())) == 1:
+        return "one Kd for all sites"
+    return f"one Kd up to a scalar: {_format_by_site(quantities.scales)}"
+
+
+def _describe_walls(quantities: WallQuantities) -> str:
+    if not quantities.walls:
+        return "no sampled wall was touched"
+    summary = "every sampled wall is passive"
+    if quantities.active:
+        summary = "a sampled wall generates energy in contact"
+    texts = [
+        f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own "
+        f"damping {wall.arm_damping_n_s_m:.3g}; generated {wall.generated_j:.3g} J "
+        "with respect to qd"
+        for wall in quantities.active or quantities.walls
+    ]
+    return f"{summary}: {'; '.join(texts)}"
+
+
+def _describe_dominance(quantities: DominanceQuantities) -> str:
+    if quantities.changing:
+        text = f"the shares of {_join_limited(quantities.changing)} change"
+        losses = [
+            f"{loss.site} without {loss.peer} {loss.from_s:.4g} to {loss.to_s:.4g} s"
+            for loss in quantities.losses
+        ]
+        if losses:
+            text += f": {_join_limited(losses)}; the remaining sites follow each other"
+        return text
+    if len(quantities.groups) > 1:
+        return describe_closed_groups(quantities.groups)
+    if quantities.weightless:
+        leaders = ", ".join(quantities.groups[0])
+        followers = ", ".join(quantities.weightless)
+        return (
+            f"alpha is reducible: none of {leaders} follows {followers}, whose beta is 0, so V "
+            f"says nothing about {followers}, which follow as in a cascade"
+        )
+    text = "constant, alpha irreducible"
+    if quantities.beta is not None:
+        text += f"; beta: {_format_by_site(quantities.beta)}"
+    return text
+
+
+def _describe_delays(quantities: DelayQuantities) -> str:
+    if quantities.varying:
+        ages = [
+            f"{link.peer}->{link.site} "
+            f"({1e3 * link.shortest_s:.4g} to {1e3 * link.longest_s:.4g} ms)"
+            for link in quantities.varying
+        ]
+        return f"the age of the sample in use varies: {_join_limited(ages)}"
+    if not quantities.constant_s:
+        return "no sample came into use"
+    delays = {f"{1e3 * delay_s:.4g} ms" for delay_s in quantities.constant_s}
+    return f"constant on every link: {', '.join(sorted(delays))}"
+
+
+def _describe_following(quantities: FollowingQuantities) -> str:
+    texts = [
+        f"{site} {from_s:.4g} to {to_s:.4g} s"
+        for site, from_s, to_s in quantities.interruptions
+    ]
+    for site, count in quantities.limited_ticks.items():
+        ticks = count_nouns(count, "tick")
+        texts.append(f"{site} with a reference as fast as it may be at {ticks}")
+    if not texts:
+        return "every site follows its peers all the time"
+    modes = "hold, brake, return or stop" if quantities.is_halted else "hold, brake or return"
+    return f"{modes}: {_join_limited(texts)}"
+
+
+def _describe_torques(quantities: TorqueQuantities) -> str:
+    if not quantities.cut:
+        return "never cut off"
+    texts = [
+        f"{cut.site}{_name_joints(cut.joints)} at {count_nouns(cut.ticks, 'tick')}"
+        for cut in quantities.cut
+    ]
+    return f"cut off: {_join_limited(texts)}"
+
+
+def _describe_stops(quantities: StopQuantities) -> str:
+    if not quantities.touched:
+        return "no stop is touched"
+    texts = [
+        f"{stop.site}{_name_joints(stop.joints)} from {stop.from_s:.4g} s on"
+        for stop in quantities.touched
+    ]
+    return f"the arm runs into the stops of its joints: {_join_limited(texts)}"
+
+
+def _name_joints(joints: Sequence[str]) -> str:
+    """Returns the names of joints in parentheses, with a space before them."""
+    return f" ({_join_limited(joints)})" if joints else ""
+
+
+def _describe_axes(quantities: AxisQuantities) -> str:
+    if not quantities.faults:
+        return "every site follows along each axis along which it moves and is followed"
+    return _join_limited(
+        [
+            f"{follower} follows {site} along an axis that {site} does not follow"
+            for follower, site in quantities.faults
+        ]
+    )
+
+
+def _describe_singular_poses(quantities: SingularPoseQuantities) -> str:
+    if quantities.near_s:
+        texts = [f"{site} from {from_s:.4g} s on" for site, from_s in quantities.near_s.items()]
+        return f"a pose is so nearly singular that it is damped: {_join_limited(texts)}"
+    bounds = _format_by_site(quantities.least_values)
+    return f"no pose is near one; least singular value at least: {bounds}"
+
+
+def _describe_operators(quantities: OperatorQuantities) -> str:
+    if quantities.unmeasured:
+        return f"no record says who pushes the arm of {_join_limited(quantities.unmeasured)}"
+    if quantities.weightless:
+        sites = _join_limited(quantities.weightless)
+        return f"{sites}, of beta 0, is pushed: V does not show that"
+    supply = quantities.supply
+    if supply is None:
+        return "nobody pushes"
+    sources = " and ".join(supply.sources)
+    if supply.is_passive:
+        return f"the {sources} only absorbed energy: passive with respect to r"
+
+    r = "qd - v" if supply.in_task_space else "qd + Lambda e"
+    text = f"the {sources} supplied up to {supply.energy_j:.3g} J with respect to r = {r}"
+    if supply.free_s >= supply.least_free_s:
+        return f"{text}; nobody pushes after {supply.released_s:.3f} s"
+    if supply.free_s > 1e-9:
+        return (
+            f"{text}, and push until {supply.released_s:.3f} s: {supply.free_s:.3g} s of free "
+            f"motion at the end are less than {supply.least_free_s:.3g} s"
+        )
+    return f"{text}, and push to the end: not passive with respect to r"
+
+
+def _describe_records(quantities: RecordQuantities) -> str:
+    if quantities.unjudged_s:
+        spans = [f"{from_s:.4g} to {to_s:.4g} s" for from_s, to_s in quantities.unjudged_s]
+        return f"not judged: {_join_limited(spans)}: records are missing there"
+    text = "every period of every site rests on records"
+    return text if quantities.is_whole else f"{text} while all sites were present"
+
+
+def _describe_presence(quantities: PresenceQuantities) -> str:
+    spans = [f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in quantities.absent]
+    stretches = "; ".join(map(_describe_stretch, quantities.stretches))
+    return (
+        f"away: {_join_limited(spans)}, about which the theorem says nothing; "
+        f"by themselves: {stretches}"
+    )
+
+
+def _describe_stretch(stretch: PresentStretch) -> str:
+    span = f"{stretch.from_s:.4g} to {stretch.to_s:.4g} s"
+    if stretch.follow_from_s is None:
+        return f"{span} not all follow"
+    delays = "delays are constant"
+    if stretch.varying:
+        links = [f"{peer}->{site}" for peer, site in stretch.varying]
+        delays = f"ages vary ({_join_limited(links)})"
+    return f"{span} all follow from {stretch.follow_from_s:.4g} s on, {delays}"
+
+
+def _describe_books(quantities: BooksQuantities) -> str:
+    sizes = f"{quantities.residual_j:.1e} J of {quantities.scale_j:.4g} J"
+    return f"the books of {quantities.site}'s law close to {sizes}, and the others closer"
+
+
+def _describe_booked_torques(quantities: BookedTorqueQuantities) -> str:
+    if quantities.unbooked:
+        sites = ", ".join(quantities.unbooked)
+        return f"cut off at {sites}: the law books another torque than the arm got"
+    if quantities.cut:
+        return f"cut off at {', '.join(quantities.cut)}, and booked so"
+    return "never cut off"
+
+
+def _describe_sampling(quantities: SamplingQuantities) -> str:
+    energy = f"up to {quantities.leak_j:.3g} J more than its law books"
+    return f"the arm of {quantities.site} got {energy}, between ticks"
+
+
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    LawQuantities: _describe_law,
+    ParameterQuantities: _describe_parameters,
+    GainQuantities: _describe_gains,
+    WallQuantities: _describe_walls,
+    DominanceQuantities: _describe_dominance,
+    DelayQuantities: _describe_delays,
+    FollowingQuantities: _describe_following,
+    TorqueQuantities: _describe_torques,
+    StopQuantities: _describe_stops,
+    AxisQuantities: _describe_axes,
+    SingularPoseQuantities: _describe_singular_poses,
+    OperatorQuantities: _describe_operators,
+    RecordQuantities: _describe_records,
+    PresenceQuantities: _describe_presence,
+    BooksQuantities: _describe_books,
+    BookedTorqueQuantities: _describe_booked_torques,
+    SamplingQuantities: _describe_sampling,
+}
+"""For each class of quantities, the function that writes its sentence."""
+
+
+def _join_limited(items: Sequence[str]) -> str:
+    """Joins texts with commas. Counts the texts beyond `MAX_LISTED_NAMES` instead."""
+    text = ", ".join(items[:MAX_LISTED_NAMES])
+    hidden = len(items) - MAX_LISTED_NAMES
+    return f"{text} and {hidden} more" if hidden > 0 else text
+
+
+def _format_by_site(values: Mapping[str, float]) -> str:
+    """Returns a string such as "m1 0.5, s 2" of a value per site."""
+    return ", ".join(f"{site} {value:.4g}" for site, value in values.items())

@@ -1,0 +1,222 @@
+"""Finds the period after which the delays of all links and the ticks of all sites repeat.
+
+A tick is one period of the control loop of a site, the process that runs one arm. A link is a
+connection between two sites. Its delay may be constant, follow a sinusoid, or follow a trace,
+a table of delays by time, that starts again at its end. A loop with such delays repeats after
+the least common multiple of all periods. Two sinusoids of 1.20 s and 1.21 s, for example,
+repeat after 145.2 s.
+
+Invariant:
+    - Periods are computed in exact fractions of a second, so that no rounding error turns a
+      short period into a long one.
+    - Random delays, measured delays, and traces that end have no period.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.links.delay import DelayKind, TraceEnd
+from ..scenario.delay_models import LinkBase
+from ..scenario.scenario_types import Scenario, scheduled_links
+
+MAX_PERIOD_TICKS = 400_000
+"""Longest true period that is analysed, in ticks of the fastest site."""
+MAX_NEAR_PERIOD_S = 60.0
+"""Longest near period that is searched, and longest analysed span of a delay trace, in s."""
+_SLIP = 0.05
+"""Largest change of delays that count as repeating after a span, as a share of a tick.
+
+If there is no such span, the span with the smallest slip is used, up to half a tick.
+"""
+_US_PER_S = 1_000_000
+
+
+def _find_cycle(link: LinkBase) -> Fraction | None:
+    """Returns the period of a link's delay, in s. None if its delay is constant or ends."""
+    model = link.to_core_model()
+    points = link.points
+    if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
+        # the last point lasts as long as the point before it
+        last_us = int(points[-1, 0])
+        end_us = 2 * last_us - int(points[-2, 0])
+        return Fraction(end_us, _US_PER_S)
+    if model.kind == DelayKind.SINE:
+        return Fraction(round(model.extra), _US_PER_S)
+    return None
+
+
+def find_link_period_s(link: LinkBase) -> float | None:
+    """Returns the period of a link's delay, in s.
+
+    Args:
+        link: Delay model of the link.
+
+    Returns:
+        The period. None if the delay is constant, random or measured, or follows a trace that
+        ends.
+    """
+    if is_ending_trace(link):
+        return None
+    cycle = _find_cycle(link)
+    return None if cycle is None else float(cycle)
+
+
+def _find_common_period(cycles: Iterable[Fraction], common_hz: int) -> Fraction:
+    """Returns the shortest time that contains a whole number of ticks and of all cycles, in s.
+
+    For fractions in lowest terms, the least common multiple of a / b and c / d is
+    lcm(a, c) / gcd(b, d).
+
+    Args:
+        cycles: Periods of the delays of the links, in s.
+        common_hz: Greatest common divisor of the tick rates of all sites.
+    """
+    period = Fraction(1, common_hz)
+    for cycle in cycles:
+        numerator = math.lcm(period.numerator, cycle.numerator)
+        denominator = math.gcd(period.denominator, cycle.denominator)
+        period = Fraction(numerator, denominator)
+    return period
+
+
+def _find_near_period_s(
+    cycles: Iterable[Fraction],
+    rates_hz: Sequence[int],
+) -> float | None:
+    """Returns a time after which delays repeat to within half a tick, in s.
+
+    The shortest time with a deviation of at most `_SLIP` is preferred, then the time with the
+    least deviation.
+
+    Args:
+        cycles: Periods of the delays of the links, in s.
+        rates_hz: Tick rate of each site.
+
+    Returns:
+        The time, at most `MAX_NEAR_PERIOD_S`. None if there is none.
+    """
+    common_hz = math.gcd(*rates_hz)
+    span_count = round(MAX_NEAR_PERIOD_S * common_hz)
+    spans_s = np.arange(1, span_count + 1) / common_hz
+    # share of a tick by which the delays fail to repeat after each span
+    slips = np.zeros(len(spans_s))
+    for cycle in cycles:
+        cycle_s = float(cycle)
+        whole_cycles = np.maximum(1.0, np.round(spans_s / cycle_s))
+        difference_s = np.abs(spans_s - cycle_s * whole_cycles)
+        slips = np.maximum(slips, difference_s * max(rates_hz))
+
+    limit = max(_SLIP, float(slips.min()))
+    first_match = int(np.argmax(slips <= limit))
+    if slips[first_match] > 0.5:
+        return None
+    return float(spans_s[first_match])
+
+
+class _DelayPeriod(NamedTuple):
+    """The period after which the delays of all links and the ticks of all sites repeat.
+
+    Attributes:
+        true_s: The period, in s. None if some delay never repeats.
+        span_s: A period that can be analysed, in s: the true one, or a shorter one after which
+            the delays repeat to within half a tick. None if there is neither.
+    """
+
+    true_s: float | None
+    span_s: float | None
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the analysed period is the true one."""
+        return self.span_s is not None and self.span_s == self.true_s
+
+
+def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _DelayPeriod:
+    """Finds the period after which the delays of links and the ticks of sites repeat.
+
+    A tick is one period of a site's control loop. The true period is the least common multiple
+    of the ticks and of the periods of all delays. If it is longer than `MAX_PERIOD_TICKS`, a
+    shorter time is searched after which the delays nearly repeat.
+
+    Args:
+        links: Delay models of the links.
+        rates_hz: Tick rate of each site.
+
+    Returns:
+        The period. It has no values if a delay is random, or follows a trace that ends.
+    """
+    for link in links:
+        if link.random or link.measured or is_ending_trace(link):
+            return _DelayPeriod(None, None)
+    cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
+    true_period = _find_common_period(cycles, math.gcd(*rates_hz))
+    true_s = float(true_period)
+    if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:
+        return _DelayPeriod(true_s, true_s)
+    return _DelayPeriod(true_s, _find_near_period_s(cycles, rates_hz))
+
+
+def is_ending_trace(link: LinkBase) -> bool:
+    """Returns True if a link plays a delay trace that does not start again at its end.
+
+    Args:
+        link: Delay model of the link.
+    """
+    model = link.to_core_model()
+    return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
+
+
+def find_final_link(scenario: Scenario, name: str) -> LinkBase:
+    """Returns the delay model of a link that is in force at the end of a scenario.
+
+    Args:
+        scenario: Description of the experiment. Its timeline may change the link.
+        name: Name of the link, for example "m1->s".
+    """
+    end_ns = round(scenario.duration_s * 1e9)
+    link: LinkBase = scenario.links[name]
+    for from_ns, later in scheduled_links(scenario.timeline, name):
+        link = later if from_ns <= end_ns else link
+    return link
+
+
+def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
+    """Finds the period of all delays and ticks that are in force at the end of a scenario.
+
+    Args:
+        scenario: Description of the experiment.
+    """
+    links = [find_final_link(scenario, name) for name in scenario.links]
+    rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+    return find_delay_period(links, rates_hz)
+
+
+def find_burst_interval_s(scenario: Scenario) -> float | None:
+    """Finds the mean time from one burst of lost samples to the next one, in s.
+
+    Bursts follow the Gilbert-Elliott model: a sample that arrives may be followed by a burst,
+    in which a share `loss_bad` of the samples is lost. If a sample leaves a burst with the
+    probability r, the mean burst has 1 / r samples, which are `loss` / `loss_bad` of all.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        The longest of these times of all links that are in force at the end of the scenario.
+        None if no link loses samples in bursts.
+    """
+    intervals_s = []
+    for name in scenario.links:
+        link = find_final_link(scenario, name)
+        if link.loss_burst <= 1.0 or not 0.0 < link.loss < link.loss_bad:
+            continue
+        leave = 1.0 - (1.0 - 1.0 / link.loss_burst) / link.loss_bad
+        samples_per_burst = 1.0 / leave
+        samples_between = samples_per_burst * link.loss_bad / link.loss
+        sender = name.partition("->")[0]
+        intervals_s.append(samples_between / scenario.sites[sender].rate_hz)
+    return max(intervals_s, default=None)

@@ -1,0 +1,71 @@
+"""Defines the interface of input devices, with which a person moves an arm and feels its force.
+
+A program that supports another device has a class with the methods of `Device`, and gives an
+object of the class to `RunningSession.lead`.
+
+Invariant:
+    - All devices use the coordinates of the person who holds them: x to the right, y ahead and
+      z up. The units are m, m/s and N.
+    - The buttons are named "a", "b", "c" in their order.
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple, Protocol, Self
+
+Vector = tuple[float, float, float]
+"""Three coordinates: x to the right, y ahead, z up."""
+
+
+class DeviceState(NamedTuple):
+    """Measured state of an input device: the motion of its handle, and its buttons.
+
+    >>> tn.DeviceState((0.0, -0.12, 0.15), (0.0, 0.0, 0.0), {"a": True}).buttons["a"]
+    True
+
+    Attributes:
+        position_m: Position in m. The origin is arbitrary, because only changes are used.
+        velocity_m_s: Velocity in m/s.
+        buttons: For each button by its name, True if it is pressed.
+    """
+
+    position_m: Vector
+    velocity_m_s: Vector
+    buttons: Mapping[str, bool]
+
+
+class Device(Protocol):
+    """Interface of an input device with which a person moves a robot arm.
+
+    An example is a haptic device. Its motion moves the target that the arm follows. The device
+    is read `rate_hz` times a second. To support another device, a user writes a class with
+    these methods.
+
+    A device is a context manager. If the connection to the device is lost, the `with` block is
+    left and entered again.
+
+    >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
+    """
+
+    rate_hz: ClassVar[int]
+
+    def __enter__(self) -> Self:
+        """Connects to the device. Raises OSError if the device is not present."""
+
+    def __exit__(self, *_: object) -> None:
+        """Ends the force of the device, and closes the connection."""
+
+    def read(self) -> DeviceState:
+        """Returns the newest state of the device.
+
+        Raises:
+            OSError: The device is silent or gone.
+        """
+
+    def render(self, force_n: Vector) -> None:
+        """Applies a force to the person who holds the device.
+
+        A device without motors does nothing.
+
+        Args:
+            force_n: Coordinates x, y and z of the force, in N.
+        """

@@ -1,0 +1,124 @@
+"""Checks the arguments that a scenario gives to a user's class, and creates the instance.
+
+The class is a control law, a hand (a program that moves an arm) or a plant (a model of an arm).
+Its arguments are the keys that the user wrote beside its name. An argument that the class does
+not have, or whose value has the wrong type, is refused before any code of the class runs. The
+error names the class, its file, the argument, and the arguments that the class has.
+"""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from ..errors import ScenarioError, suggest_nearest
+from ..laws.interface import make_instance
+
+_TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
+    float: ((int, float), "a number"),
+    int: ((int, float), "a number"),
+    str: ((str,), "a text"),
+}
+"""For each type that is checked: the types of accepted values, and its name in errors."""
+
+
+def make_own_instance(
+    kind: Any, code: str, context: Any, settings: dict[str, Any], path: str
+) -> Any:
+    """Returns an instance of a user's class, after a check of its arguments.
+
+    Args:
+        kind: The class.
+        code: Module and class, for example "mylaws:Spring", for errors.
+        context: First argument of the class: the facts about the site.
+        settings: Keyword arguments of the class.
+        path: Path of the table with the arguments in the scenario, for errors.
+
+    Raises:
+        ScenarioError: An argument is unknown, missing or of the wrong type, or the class raised
+            an exception.
+    """
+    check_arguments(kind, code, settings, path)
+    return make_instance(kind, code, context, settings, path)
+
+
+def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
+    """Refuses arguments that a user's class does not accept.
+
+    Args:
+        kind: The class, whose first argument is for the facts about the site.
+        code: Module and class, for example "mylaws:Spring", for errors.
+        settings: The keyword arguments, by name.
+        path: Path of the table with the arguments in the scenario, for errors.
+
+    Raises:
+        ScenarioError: The class has no such argument, an argument without a default is missing,
+            or a value has the wrong type.
+    """
+    try:
+        signature = inspect.signature(kind)
+    except (TypeError, ValueError):
+        return  # a class of C code has no signature, and itself refuses wrong arguments
+    parameters = list(signature.parameters.values())[1:]  # without the facts
+    named = {
+        parameter.name: parameter
+        for parameter in parameters
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    }
+    subject = _describe_class(kind, code)
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    accepted = "no arguments besides the facts about the site"
+    if named:
+        accepted = f"the arguments {', '.join(named)}"
+
+    for name, value in settings.items():
+        if name in named:
+            _check_type(named[name], value, subject, path)
+        elif not takes_any:
+            hint = suggest_nearest(name, list(named))
+            raise ScenarioError(
+                f"{subject} has no argument {name}; its __init__ takes {accepted}{hint}",
+                path=path,
+            )
+    for name, parameter in named.items():
+        if parameter.default is parameter.empty and name not in settings:
+            raise ScenarioError(
+                f"{subject} needs a value of its argument {name}, which has no default; its "
+                f"__init__ takes {accepted}",
+                path=path,
+            )
+
+
+def _describe_class(kind: Any, code: str) -> str:
+    """Returns the name of a class, with the file of its `__init__` in parentheses."""
+    file = getattr(getattr(kind.__init__, "__code__", None), "co_filename", "")
+    return f"{code} ({file})" if file else code
+
+
+def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
+    """Refuses a value that differs from the type of an argument.
+
+    The type is that of the annotation. Without an annotation, it is the type of the default,
+    and only a text in place of a number, or the reverse, is refused: the class may accept lists
+    as well.
+
+    Args:
+        parameter: The argument.
+        value: Its value in the scenario.
+        subject: Name of the class, for the error.
+        path: Path of the table with the arguments, for the error.
+    """
+    annotation = parameter.annotation
+    if isinstance(annotation, str):  # a module with `from __future__ import annotations`
+        annotation = {kind.__name__: kind for kind in _TYPE_NAMES}.get(annotation)
+    if parameter.annotation is parameter.empty:
+        annotation = type(parameter.default)
+        if not isinstance(value, str | int | float):
+            return
+    if annotation not in _TYPE_NAMES:
+        return
+    accepted, name = _TYPE_NAMES[annotation]
+    if not isinstance(value, accepted):
+        raise ScenarioError(
+            f"{subject}: its argument {parameter.name} must be {name}, but is {value!r}",
+            path=path,
+        )

@@ -1,0 +1,368 @@
+"""Manages permissions for code of users: which laws, operators and plants may run.
+
+A scenario describes an experiment, and a log contains a recorded run of it. A scenario may name
+classes that users wrote: control laws, operators (programs that move an arm), and plants
+(simulations of an arm). Code that a user names in a scenario of his or her own may run. Code
+that a log, or another member of a session, names may run only if a person names its file,
+because a stranger may have written it. A person may also let the program remember a permission;
+it is then stored in the configuration folder.
+
+Invariant:
+    - The file that a person names must have the hash that the log states, unless the person
+      explicitly allows another version.
+    - A permission applies to one class in one file, with the arguments of one log. A log with
+      other arguments needs a permission of its own, and the error message says which arguments
+      differ.
+"""
+
+import json
+import os
+import re
+from collections.abc import Container, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+
+from ..errors import ScenarioError, UsageError
+from ..files import make_folder, write_whole
+from .imported_code import (
+    CodeConsent,
+    CodeKey,
+    ImportedLaw,
+    NamedCode,
+    ScenarioWithCode,
+    allowed_code,
+    check_class,
+    describe_new_settings,
+    describe_setting,
+    find_consent,
+    read_code,
+    remembered_settings,
+)
+
+AnyScenario = TypeVar("AnyScenario", bound=ScenarioWithCode)
+LawFiles = str | Path | Sequence[str | Path]
+"""File with code of a user, or several such files."""
+
+
+def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[NamedCode]:
+    """Returns the users' classes that scenarios name, and that would run with them.
+
+    These are control laws, operators (programs that move an arm) and plants (programs that
+    compute the motion of an arm).
+
+    Args:
+        scenarios: Descriptions of the experiments.
+    """
+    imported = []
+    for scenario in scenarios:
+        for site in scenario.sites.values():
+            candidates = (site.control, *site.hands, site.plant)
+            imported += [part for part in candidates if isinstance(part, NamedCode)]
+    return imported
+
+
+def allow_own_code(
+    scenario: AnyScenario,
+    codes: Container[Any] | None = None,
+    changed_from: ScenarioWithCode | None = None,
+) -> AnyScenario:
+    """Allows the code that a scenario names to run, because a user of this process named it.
+
+    The program runs users' classes only with permission, since a scenario from elsewhere may
+    name harmful code.
+
+    Args:
+        scenario: Scenario that names the code.
+        codes: Classes that the user named, for example "package.module:Law". If None, the user
+            wrote the whole scenario, so all its code may run.
+        changed_from: Scenario from which the user made this one. Code that may run there may
+            run here as well, with its new arguments. None if there is no such scenario.
+
+    Returns:
+        The same scenario.
+    """
+    earlier_consents: dict[tuple[str, str], CodeConsent] = {}
+    if changed_from is not None:
+        for key in map(CodeKey.of, list_imported_code([changed_from])):
+            consent = find_consent(key)
+            if consent is not None:
+                earlier_consents[key.code, key.sha256] = consent
+
+    for key in map(CodeKey.of, list_imported_code([scenario])):
+        earlier_consent = earlier_consents.get((key.code, key.sha256))
+        if codes is None or key.code in codes:
+            allowed_code[key] = CodeConsent(None, key.sha256)
+        elif earlier_consent is not None:
+            allowed_code[key] = earlier_consent
+    return scenario
+
+
+class _RememberedFile(msgspec.Struct):
+    """File with a user's code for which a person has stored a permission to run.
+
+    Attributes:
+        file: Path of the file.
+        classes: For each class of the file, the sets of arguments with which it may run.
+    """
+
+    file: str
+    classes: dict[str, list[dict[str, Any]]] = {}
+
+
+def allow_logged_code(
+    scenario: ScenarioWithCode,
+    law: LawFiles = (),
+    *,
+    other_version: bool = False,
+    remember: bool = False,
+) -> None:
+    """Allows the code that a log names to run, as far as a person has permitted it.
+
+    A log may come from a stranger, so its code does not run without permission. A person
+    permits code by naming its file now, or has stored a permission before. See `open_log`.
+
+    Args:
+        scenario: Scenario of the log, which names the code.
+        law: Python files that the person permits to run. By default, there are none.
+        other_version: If True, a file may differ from the one that ran.
+        remember: If True, the permission is stored for later logs.
+
+    Raises:
+        UsageError: A file does not define code that the log names, or is another version of it;
+            or an option requires a file, and no file is named.
+        ScenarioError: A file cannot be read, or does not define such a class. No code has run.
+    """
+    files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
+    if (other_version or remember) and not files:
+        raise UsageError("--other-version and --remember need a file: give --law FILE, too")
+    logged = {CodeKey.of(imported): imported for imported in list_imported_code([scenario])}
+
+    # Without code of users, the store is not read.
+    remembered = _read_store() if logged else {}
+    _load_remembered_settings(remembered)
+    for key in logged:
+        texts = remembered_settings.get((key.sha256, _class_of(key)), [])
+        if key.sha256 in remembered and key.settings in texts:
+            file = Path(remembered[key.sha256].file)
+            allowed_code.setdefault(key, CodeConsent(file, key.sha256))
+
+    for file in files:
+        sha256, keys = _allow_file(file, logged, other_version=other_version)
+        if remember:
+            entry = remembered.setdefault(sha256, _RememberedFile(""))
+            entry.file = str(file.resolve())
+            for key in keys:
+                settings = entry.classes.setdefault(_class_of(key), [])
+                if logged[key].settings not in settings:
+                    settings.append(logged[key].settings)
+            _write_store(remembered)
+
+
+def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
+    """Makes the stored arguments available to the messages about refused code.
+
+    Args:
+        remembered: Stored permissions, by the hash of the file.
+    """
+    remembered_settings.clear()
+    for sha256, entry in remembered.items():
+        for name, settings in entry.classes.items():
+            remembered_settings[sha256, name] = [
+                json.dumps(values, sort_keys=True, default=str) for values in settings
+            ]
+
+
+def _class_of(key: CodeKey) -> str:
+    """Returns the name of the class, without its module."""
+    return key.code.partition(":")[2]
+
+
+def _find_store() -> Path:
+    """Returns the path of the file in which permissions are stored."""
+    folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(folder, "trilat-net", "laws.json")
+
+
+def _read_store() -> dict[str, _RememberedFile]:
+    """Returns the stored permissions, by the hash of the file.
+
+    If there is no store, or it cannot be read, there are no permissions. Earlier versions of
+    the program stored only the path of a file; such an entry permits nothing.
+    """
+    # A RuntimeError is raised if the user has no home folder.
+    with suppress(OSError, ValueError, RuntimeError):
+        entries = msgspec.json.decode(
+            _find_store().read_bytes(), type=dict[str, _RememberedFile | str]
+        )
+        return {
+            sha256: _RememberedFile(entry) if isinstance(entry, str) else entry
+            for sha256, entry in entries.items()
+        }
+    return {}
+
+
+def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
+    """Writes the stored permissions."""
+    make_folder(_find_store().parent)
+    # The file may be a link: people link their settings to a folder under version control.
+    store = _find_store().resolve()
+    write_whole(store, msgspec.json.format(msgspec.json.encode(remembered), indent=1))
+
+
+def _allow_file(
+    file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
+) -> tuple[str, list[CodeKey]]:
+    """Allows a file to run as code that a log names.
+
+    The file belongs to the code that has the hash of the file. If there is no such code, it
+    belongs to the code whose module has the name of the file; it is then another version of
+    that code.
+
+    Args:
+        file: The file.
+        logged: Code that the log names.
+        other_version: If True, the file may be another version.
+
+    Returns:
+        The hash of the file, and the keys of the code that was allowed.
+
+    Raises:
+        UsageError: The file is not code that the log names, or is another version.
+        ScenarioError: The file cannot be read, or does not define the class.
+    """
+    source = read_code("", "--law", file.resolve())
+    sha256 = source.sha256
+    # A package is named by its folder.
+    module = (source.file.parent if file.stem == "__init__" else file).stem
+    keys = [key for key in logged if key.sha256 == sha256]
+    if not keys:
+        # The last part of "package.module:Law" before the class is the name of the file.
+        keys = [key for key in logged if re.split(r"[.:]", key.code)[-2] == module]
+    if not keys:
+        names = ", ".join(sorted({key.code for key in logged})) or "no external code"
+        raise UsageError(
+            f"--law {file}: does not contain code that the log names; the log names {names}"
+        )
+    for key in keys:
+        if key.sha256 != sha256 and not other_version:
+            versions = _compare_hashes(key, sha256)
+            problem = f"is not the file that ran as {key.code}: {versions}"
+            raise UsageError(f"--law {file}: {problem}; --other-version accepts it")
+        check_class(source, key.code, "--law", logged[key].method)
+        allowed_code[key] = CodeConsent(source.file, sha256)
+    return sha256, keys
+
+
+def _compare_hashes(key: CodeKey, sha256: str) -> str:
+    """Returns the beginning of a file's hash, and of the hash that the log states."""
+    return f"its sha256 is {sha256[:16]}, but was {key.sha256[:16]}"
+
+
+class _LoggedUserLaw(NamedTuple):
+    """Control law of a user that a log names, and whether it may run on this computer.
+
+    Attributes:
+        code: Class of the law, for example "package.module:Law".
+        sites: Names of the sites that the law controls.
+        settings: Arguments of the class, as a string for people.
+        allowed: True if the file may run with these arguments.
+        file: The file that a person permitted, or else the file that Python's import finds for
+            the module. None if there is no such file.
+        changed: Text about the hashes if the file differs from the one that ran. Otherwise
+            empty.
+        other_settings: Text about the difference if the code was permitted with other
+            arguments. Otherwise empty.
+    """
+
+    code: str
+    sites: tuple[str, ...]
+    settings: str
+    allowed: bool
+    file: Path | None
+    changed: str
+    other_settings: str = ""
+
+    def __str__(self) -> str:
+        """Returns a sentence about the law, with the option that allows it to run."""
+        law = f"{self.code} of {', '.join(self.sites)}"
+        settings = f" with {self.settings}" if self.settings else ""
+        state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
+        if self.allowed:
+            return f"{law}{settings}; its file {state}"
+        option = "FILE"
+        if self.file:
+            version = " --other-version" if self.changed else ""
+            option = f"{self.file}{version} (it {state})"
+        difference = f" ({self.other_settings})" if self.other_settings else ""
+        problem = f"{law} is external code, which may not run{settings}{difference}"
+        return f"{problem}; if you trust it: --law {option}"
+
+
+def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
+    """Returns the control laws in a scenario that are users' classes.
+
+    None of their code is run. Each entry tells whether the law may run, and which file would be
+    used.
+
+    Args:
+        scenario: Scenario of a log.
+    """
+    sites: dict[CodeKey, tuple[str, ...]] = {}
+    laws: dict[CodeKey, ImportedLaw] = {}
+    for name, spec in scenario.sites.items():
+        if isinstance(spec.control, ImportedLaw):
+            key = CodeKey.of(spec.control)
+            sites[key] = (*sites.get(key, ()), name)
+            laws[key] = spec.control
+    return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
+
+
+def may_run_user_laws(scenario: ScenarioWithCode) -> bool:
+    """Returns True if every control law in a scenario that is a user's class may run.
+
+    Whoever permitted the laws of a log also permitted what repeats its run: twins, roots and
+    the energies that the laws declare.
+
+    Args:
+        scenario: Scenario of a log.
+    """
+    return all(law.allowed for law in find_user_laws(scenario))
+
+
+def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> _LoggedUserLaw:
+    """Finds the file of a user's control law, and whether the law may run.
+
+    None of its code is run.
+
+    Args:
+        key: Class, hash and arguments.
+        law: The law in the scenario.
+        sites: Names of the sites that it controls.
+    """
+    consent = find_consent(key)
+    sha256 = ""
+    file = None
+    with suppress(ScenarioError):
+        source = read_code(key.code, "", consent and consent.file)
+        check_class(source, key.code, "")
+        sha256 = source.sha256
+        file = source.file
+
+    is_allowed = consent is not None and consent.sha256 == sha256
+    # The hash is empty if there is no file.
+    is_changed = sha256 not in ("", key.sha256)
+    settings = ", ".join(
+        f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()
+    )
+    return _LoggedUserLaw(
+        code=key.code,
+        sites=sites,
+        settings=settings,
+        allowed=is_allowed,
+        file=file,
+        changed=_compare_hashes(key, sha256) if is_changed else "",
+        other_settings="" if is_allowed else describe_new_settings(key),
+    )

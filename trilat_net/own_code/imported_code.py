@@ -1,0 +1,640 @@
+"""Imports classes that users write: control laws, operators who move an arm, and plants.
+
+A scenario names a class by its module and its name, for example
+`law = "package.module:Law"`. Importing a module runs its code, and a scenario may come from a
+stranger. Therefore code runs only if a person has permitted it before. A permission applies to
+one class in one file, which is identified by its SHA-256 hash.
+
+Invariant:
+    - A scenario contains the hash of the file that defines a class. If a run is repeated from
+      its log, the hash shows whether the code is still the code that ran.
+    - Looking up a class by its name runs no code, not even that of the packages around it.
+    - `import_class` is the only way to run code of users. It imports a class only if
+      `allowed_code` contains a permission, and if the file still has the permitted hash and
+      defines a class of that name.
+    - A permission includes the arguments of the class. Harmless code may do harm with other
+      arguments, for example if an argument is the name of a file that it overwrites.
+"""
+
+import ast
+import hashlib
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast, runtime_checkable
+
+from msgspec import Meta, field
+
+from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
+from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
+from ..files import find_page, open_regular
+from ..laws.interface import LawSettings, check_law_class
+from ..laws.sent_vectors import SentVectorSpecs, convert_sends
+from .class_arguments import make_own_instance
+from .sent_channel import parse_classes
+
+CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
+
+_imported: dict[str, str] = {}
+"""For each module that Python's import has loaded, the hash that its file had then."""
+
+
+Watch = Callable[[int, Callable[[], Any]], Any]
+"""Function that calls a user's code and returns its result, for example with a time limit.
+
+Its arguments are the tick and the call, a function without arguments.
+"""
+
+
+def call_directly(_k: int, function: Callable[[], Any]) -> Any:
+    """Calls a user's code without a time limit.
+
+    In a live session, a user's code must not delay the control loop, so its calls are watched.
+    This function takes the place of such a `Watch` in virtual time, in which no other process
+    waits for the result.
+
+    Args:
+        _k: Number of the tick in which the call is made. It is not used.
+        function: Function without arguments that makes the call.
+
+    Returns:
+        The result of the function.
+    """
+    return function()
+
+
+@runtime_checkable
+class NamedCode(Protocol):
+    """Interface of an entry of a scenario that names a user's class.
+
+    The class is a control law, an operator (a program that moves an arm) or a plant (a program
+    that computes the motion of an arm).
+
+    Attributes:
+        method: Method that the class must have.
+    """
+
+    method: ClassVar[str]
+
+    @property
+    def code(self) -> str:
+        """Module and name of the class, for example "package.module:Law"."""
+
+    @property
+    def source_sha256(self) -> str:
+        """SHA-256 hash of the file of the module. It shows whether the file has changed."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments with which an object of the user's class is created, by name."""
+
+
+class SiteWithCode(Protocol):
+    """Interface of a site of a scenario whose parts may be classes of users."""
+
+    @property
+    def control(self) -> Any:
+        """Control law of the site."""
+
+    @property
+    def hands(self) -> Sequence[Any]:
+        """Operators who move the arm of the site."""
+
+    @property
+    def plant(self) -> Any:
+        """What computes the motion of the arm."""
+
+
+class ScenarioWithCode(Protocol):
+    """Interface of a scenario, the description of an experiment, that may name classes."""
+
+    @property
+    def sites(self) -> Mapping[str, SiteWithCode]:
+        """The sites, each of which is a process that controls one arm, by name."""
+
+
+ANY_SETTINGS = "*"
+"""In place of settings: the permission applies to all arguments.
+
+Only the worker processes of a study receive such a permission, because a study varies the
+arguments itself.
+"""
+
+
+class CodeKey(NamedTuple):
+    """Identification of a user's code: a class, the hash of its file and its arguments.
+
+    A person permits code to run under this key. If the file or an argument changes, the
+    permission no longer applies.
+
+    Attributes:
+        code: Module and class, for example "package.module:Law".
+        sha256: SHA-256 hash of the file, as the scenario states it.
+        settings: Arguments of the class as a JSON text with sorted keys, or `ANY_SETTINGS`.
+    """
+
+    code: str
+    sha256: str
+    settings: str
+
+    @classmethod
+    def of(cls, named: NamedCode) -> "CodeKey":
+        """Returns the identification under which a user's class may be permitted to run.
+
+        Args:
+            named: Entry of a scenario that names the class: a control law, an operator or a
+                plant.
+        """
+        return cls(
+            named.code,
+            named.source_sha256,
+            json.dumps(named.settings, sort_keys=True, default=str),
+        )
+
+
+class CodeConsent(NamedTuple):
+    """Permission to run the code of a file.
+
+    Attributes:
+        file: Path of the file. If None, it is the file that Python's import finds for the
+            module.
+        sha256: SHA-256 hash that the file must have. Otherwise the permission does not apply.
+    """
+
+    file: Path | None
+    sha256: str
+
+
+CodeConsents = dict[CodeKey, CodeConsent]
+allowed_code: CodeConsents = {}
+"""Permissions for this process. Worker processes receive a copy."""
+remembered_settings: dict[tuple[str, str], list[str]] = {}
+"""Arguments that were permitted in earlier sessions, as the JSON text of `CodeKey.settings`.
+
+The keys are the hash of the file and the name of the class. The texts serve only to explain
+what differs if code is refused; they permit nothing.
+"""
+
+
+def find_consent(key: CodeKey) -> CodeConsent | None:
+    """Looks up whether a user's code may run with its arguments.
+
+    Args:
+        key: Class, hash of its file and arguments.
+
+    Returns:
+        The permission. None if the code may not run.
+    """
+    return allowed_code.get(key) or allowed_code.get(key._replace(settings=ANY_SETTINGS))
+
+
+@contextmanager
+def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
+    """Permits code with any arguments, inside the `with` block.
+
+    Normally, a permission applies only to certain arguments of a class. A parameter study
+    varies the arguments itself, so it needs a wider permission.
+
+    Args:
+        allowed: Permissions of the code that is studied.
+    """
+    widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
+    added = {key: consent for key, consent in widened.items() if key not in allowed_code}
+    allowed_code.update(added)
+    try:
+        yield
+    finally:
+        for key in added:
+            allowed_code.pop(key, None)
+
+
+def describe_new_settings(key: CodeKey) -> str:
+    """Explains why a user's class that was permitted before is refused with new arguments.
+
+    A permission applies only to certain arguments of a class. The text states how the arguments
+    of the refused code differ from permitted ones. If several sets of arguments were permitted,
+    those with the fewest differences are compared.
+
+    Args:
+        key: The refused class, with the hash of its file and its arguments.
+
+    Returns:
+        Part of a sentence. Empty if the code was not permitted with any arguments.
+    """
+    allowed_settings = {
+        allowed.settings
+        for allowed in allowed_code
+        if (allowed.code, allowed.sha256) == (key.code, key.sha256)
+        and allowed.settings != ANY_SETTINGS
+    }
+    class_name = key.code.partition(":")[2]
+    allowed_settings |= set(remembered_settings.get((key.sha256, class_name), ()))
+
+    settings = json.loads(key.settings)
+    differences = [
+        _list_differences(json.loads(text), settings) for text in sorted(allowed_settings)
+    ]
+    smallest_difference = min(differences, key=len, default=[])
+    if not smallest_difference:
+        return ""
+    return f"it was allowed with other settings, but here {', '.join(smallest_difference)}"
+
+
+def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Returns a string for each argument whose value differs, such as "gain = 5 (was 3)".
+
+    An argument that is missing on one side has its default there.
+    """
+    old_texts = {key: describe_setting(value) for key, value in before.items()}
+    new_texts = {key: describe_setting(value) for key, value in now.items()}
+    differences = []
+    for key in sorted({*old_texts, *new_texts}):
+        old = old_texts.get(key, "its default")
+        new = new_texts.get(key, "its default")
+        if old_texts.get(key) != new_texts.get(key):
+            differences.append(f"{key} = {new} (was {old})")
+    return differences
+
+
+LONGEST_SETTING = 300
+"""Largest length up to which an argument is shown completely. Paths are usually shorter."""
+
+
+def describe_setting(value: Any) -> str:
+    """Returns the value of an argument as a string for messages.
+
+    It is a JSON text, which contains no control characters. A long text is shortened in the
+    middle, because paths of files differ at their ends.
+
+    Args:
+        value: Value of the argument, of any type that JSON supports.
+    """
+    text = json.dumps(value, default=str)
+    if len(text) <= LONGEST_SETTING:
+        return text
+    half = LONGEST_SETTING // 2
+    return f"{text[:half]} ... {text[-half:]} ({len(text)} characters)"
+
+
+_executed: dict["_CodeSource", Any] = {}
+"""Modules that were executed from a file that a person named, by the content of the file."""
+
+
+class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
+    """Control law of a scenario that is a user's class.
+
+    Attributes:
+        code: Module and class, for example "package.module:Law".
+        source_sha256: SHA-256 hash of the file of the module.
+        settings: Arguments of the class, by name.
+        sends: Vectors that the law sends to its peers, as the class declares them.
+    """
+
+    method: ClassVar[str] = "torque"
+
+    code: Annotated[str, Meta(pattern=CLASS_PATTERN, max_length=200)]
+    source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
+    settings: dict[str, Any] = field(default_factory=dict)
+    sends: SentVectorSpecs = field(default_factory=dict)
+
+    def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
+        """Returns a function that creates the control law for a site.
+
+        The user's class is imported only when the returned function is called.
+
+        Args:
+            sites: Number of sites of the experiment.
+            scheme: Integration scheme of the experiment.
+        """
+
+        def make(context: LawContext) -> UserLaw:
+            path = f"sites.{context.site}.control"
+            kind = import_class(CodeKey.of(self), f"{path}.law")
+            # The class is checked before any of its code is called.
+            check_law_class(
+                kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
+            )
+            declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
+            # The order is compared too, because it is the order of the vectors in a message.
+            if list(declared.items()) != list(self.sends.items()):
+                raise ScenarioError(
+                    f"{self.code} sends different vectors from those in the scenario: define "
+                    "`sends` explicitly in the body of the class, and set law = "
+                    f"{self.code!r} again so that the scenario is updated",
+                    path=f"{path}.sends",
+                )
+            law: UserLaw = make_own_instance(kind, self.code, context, self.settings, path)
+            return law
+
+        return make
+
+
+class _CodeSource(NamedTuple):
+    """Python file that defines a user's class, as it was read from disk.
+
+    Its content is stored, so that exactly the checked text is run.
+
+    Attributes:
+        file: Path of the file.
+        content: Content of the file.
+        sha256: SHA-256 hash of the content.
+    """
+
+    file: Path
+    content: bytes
+    sha256: str
+
+
+def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
+    """Reads the file that defines a class, without running any code of it.
+
+    Args:
+        code: Module and class, for example "package.module:Law".
+        path: Path of the key in the scenario, for error messages.
+        file: The file. None for the file that Python's import finds for the module.
+
+    Raises:
+        ScenarioError: There is no such file, or it cannot be read.
+    """
+    source_file = file or _find_file(code, path)
+    try:
+        with open_regular(source_file) as stream:
+            content = stream.read()
+    except OSError as error:
+        raise ScenarioError(
+            f"{source_file} cannot be read: {error.strerror}", path=path
+        ) from None
+    return _CodeSource(source_file, content, hashlib.sha256(content).hexdigest())
+
+
+def _find_file(code: str, path: str) -> Path:
+    """Returns the file that Python's import finds for the module of a class.
+
+    Raises:
+        ScenarioError: There is no such module, or it is not a file.
+    """
+    module, _, name = code.partition(":")
+    with _searching(None):
+        spec = _find_spec(module)
+    if spec is None and module.endswith(".py"):
+        raise ScenarioError(
+            f"is {code!r}, but must name the module, not its file: "
+            f"{module.removesuffix('.py')}:{name}",
+            path=path,
+        )
+    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+        raise ScenarioError(
+            f"the module {module}, which {code} names, was not found; install the module, or "
+            "run the command in its folder (folders on PYTHONPATH are searched, too)",
+            path=path,
+        )
+    return Path(spec.origin)
+
+
+def _find_spec(module: str) -> ModuleSpec | None:
+    """Finds a module in the same way as an import does, but without importing its packages.
+
+    Only Python's path finder and the finders of editable installations are asked. Other finders
+    may run code: that of `distutils` imports the nearest setuptools.
+
+    Args:
+        module: Name of the module, with dots.
+
+    Returns:
+        The spec of the module, which contains its file. None if it is not found.
+    """
+    finders = [
+        finder
+        for finder in sys.meta_path
+        if finder is PathFinder or finder.__module__.startswith("__editable__")
+    ]
+    spec = None
+    search_folders = None
+    parts = module.split(".")
+    for depth in range(1, len(parts) + 1):
+        name = ".".join(parts[:depth])
+        try:
+            specs = (finder.find_spec(name, search_folders) for finder in finders)
+            spec = next((candidate for candidate in specs if candidate is not None), None)
+        except (ImportError, ValueError, AttributeError, LookupError):
+            return None
+        if spec is None:
+            return None
+        search_folders = spec.submodule_search_locations
+        is_package = search_folders is not None
+        if not is_package and name != module:
+            return None
+    return spec
+
+
+def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
+    """Imports a user's class from the file that may run for it.
+
+    The file must be the one that a person permitted. It is checked before any of its code runs.
+
+    Args:
+        key: The class, with the hash of its file and its arguments.
+        path: Path of the key in the scenario, for error messages.
+        method: Method that the class must have.
+
+    Raises:
+        CodeWithheld: There is no permission.
+        ScenarioError: The file differs from the permitted one, or does not define such a class.
+            In these cases, none of its code has run. Or the code raises an error while it is
+            imported.
+    """
+    code = key.code
+    module, _, name = code.partition(":")
+    consent = find_consent(key)
+    if consent is None:
+        difference = describe_new_settings(key)
+        reason = f" ({difference})" if difference else ""
+        raise CodeWithheld(
+            f"{code} is external code, which may not run{reason}: allow its file with "
+            "--law FILE (in Python: tn.open_log(..., law=FILE))",
+            path=path,
+        )
+
+    source = read_code(code, path, consent.file)
+    if source.sha256 != consent.sha256:
+        raise ScenarioError(
+            f"the file of {code} has changed: its hash is not the permitted one; restore the "
+            f"file, or write {code!r} in the scenario again to use the present file",
+            path=path,
+        )
+    check_class(source, code, path, method)
+
+    search_folder = None
+    if consent.file is not None:
+        search_folder = _find_import_folder(module, source.file)
+    with _searching(search_folder):
+        try:
+            if consent.file is not None:
+                imported = _execute(module, source)
+            else:
+                imported = _import(module, source.sha256)
+        # The user's code may raise anything.
+        except (Exception, SystemExit) as error:
+            problem = f"{module} cannot be imported: {describe_exception(error)}"
+            raise ScenarioError(problem, path=path) from None
+    return getattr(imported, name)
+
+
+def _find_import_folder(module: str, file: Path) -> Path:
+    """Returns the folder that must be on Python's search path to import a module from a file.
+
+    For a plain module, it is the folder of the file. For a module in packages, it is the folder
+    that contains the outermost package.
+    """
+    depth = module.count(".") + (file.stem == "__init__")
+    return file.parents[min(depth, len(file.parents) - 1)]
+
+
+PAGES = {
+    "torque": ("law", "own-controller.md"),
+    "act": ("hand", "policies.md"),
+    "step": ("plant", "own-plant.md"),
+}
+"""For each required method: the name of such a class, and its page in the docs."""
+
+
+def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
+    """Refuses a file that does not define a certain class with a certain method.
+
+    The check reads the syntax of the file, and runs no code of it.
+
+    Args:
+        source: File, as it was read from disk.
+        code: Module and class, for example "package.module:Law".
+        path: Path of the key in the scenario, for error messages.
+        method: Method that the class must have.
+
+    Raises:
+        ScenarioError: The file is not valid Python, has no such class, or the class has neither
+            the method nor a base class or decorator that may add it.
+    """
+    kind, page = PAGES[method]
+    name = code.partition(":")[2]
+    classes = parse_classes(source.content, source.file, path)
+    if name not in classes:
+        hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
+        raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
+    node = classes[name]
+    identifiers = {getattr(part, "name", getattr(part, "id", "")) for part in ast.walk(node)}
+    may_inherit_method = node.bases or node.keywords or node.decorator_list
+    if not may_inherit_method and method not in identifiers:
+        raise ScenarioError(
+            f"{code} is not a {kind}: the class has no {method}; see {find_page(page)}",
+            path=path,
+        )
+
+
+def _import(module: str, sha256: str) -> Any:
+    """Imports a module in Python's usual way, and reloads it if its file has changed.
+
+    Args:
+        module: Name of the module.
+        sha256: Hash of its file now.
+    """
+    imported = importlib.import_module(module)
+    if _imported.setdefault(module, sha256) != sha256:
+        imported = importlib.reload(imported)
+        _imported[module] = sha256
+    return imported
+
+
+def _execute(module: str, source: _CodeSource) -> Any:
+    """Executes the content of a file as a module, and returns the module.
+
+    Exactly the content that was checked is executed. Python's own import might read the file
+    again, or load a compiled version of it from `__pycache__`.
+
+    Args:
+        module: Name that the module gets.
+        source: The file and its content.
+    """
+    if source in _executed:
+        return _executed[source]
+
+    file = str(source.file)
+    previous_module = sys.modules.get(module)
+    spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
+    executed = module_from_spec(cast(ModuleSpec, spec))
+    sys.modules[module] = executed
+    try:
+        exec(compile(source.content, file, "exec"), executed.__dict__)
+    finally:
+        # A log may give its module any name: it must not replace another module for good.
+        sys.modules.pop(module, None)
+        if previous_module is not None:
+            sys.modules[module] = previous_module
+    _executed[source] = executed
+    return executed
+
+
+def _name_law_class(kind: type) -> str:
+    """Returns the name with which a scenario names a user's class.
+
+    For example, the class Spring in the file mylaws.py has the name "mylaws:Spring".
+
+    Args:
+        kind: The class.
+
+    Raises:
+        ScenarioError: The class is not defined in a file, or not at the top level of its
+            module.
+    """
+    module = kind.__module__
+    name = kind.__qualname__
+    if module == "__main__":
+        # The script that runs is a module under the name of its file.
+        module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
+    if not module or not name.isidentifier():
+        raise ScenarioError(
+            f"{name} is not defined in a file, so a log cannot refer to it: write the "
+            "class to a file (in a notebook, with %%writefile mylaws.py) and import it from "
+            f"there; see {find_page('own-controller.md')}"
+        )
+    return f"{module}:{name}"
+
+
+def name_law_classes(value: Any) -> Any:
+    """Converts a value that a Python program passed to types that TOML supports.
+
+    A user's class becomes its name (see `_name_law_class`), and a number or an array of NumPy
+    becomes a number or a list. Tables are converted entry by entry. Other values are returned
+    unchanged.
+
+    Args:
+        value: Value for a scenario.
+    """
+    if isinstance(value, type):
+        return _name_law_class(value)
+    if isinstance(value, Mapping):
+        return {str(key): name_law_classes(entry) for key, entry in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+@contextmanager
+def _searching(folder: Path | None) -> Iterator[None]:
+    """Makes Python search a folder for modules before all others, inside the `with` block.
+
+    Args:
+        folder: The folder. None for the working directory, unless Python searches it already.
+    """
+    search_path = str(folder or Path.cwd())
+    if folder is None and search_path in sys.path:
+        yield
+        return
+    sys.path.insert(0, search_path)
+    # A file may have been written a moment ago.
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path.remove(search_path)

@@ -1,0 +1,208 @@
+"""Defines the signals that only figures and pages show, and reduces signals for plots.
+
+A signal is an array with a row for each record (the result of one tick of the arm's control
+loop). `analysis.site_signals` has the signals that metrics and summaries use too. For plots,
+the rows are reduced: each bucket of records keeps the minimum and the maximum of each column,
+so that a spike of a single tick at 1 kHz stays visible. A gap in the records that is wider than
+a bucket becomes a row of NaN, so that no line is drawn across it.
+
+Invariant:
+    - Empty logs give empty arrays.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.step.vectors import Array
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
+
+
+def reference_angles(part: SiteLog) -> Array:
+    """Returns the angles that the joints of a site should reach, in rad.
+
+    The reference q_des, Eq. (6), is the weighted mean of the peers' delayed angles. In task
+    space the joints have no reference, and the angles q themselves are returned.
+
+    Args:
+        part: Log of the site.
+
+    Returns:
+        Angles, shape (K, n).
+    """
+    return part.q if part.layout.task else part.q_des
+
+
+def joint_error_rates(part: SiteLog) -> Array:
+    """Returns the derivative of a site's error: its velocity minus the followed velocity.
+
+    A site is the process that runs one arm.
+
+    Args:
+        part: The site's part of the log, with K records.
+
+    Returns:
+        Velocity errors of the n joints, shape (K, n), in rad/s. If the arm follows with its end
+        effector, they are the errors of its m coordinates, shape (K, m).
+    """
+    if part.layout.task:
+        # in task space the column qd_des holds xd_des
+        velocity_error = part.xd - part.qd_des
+        followed_axes = np.array(part.axes)
+        rates: Array = velocity_error * followed_axes
+        return rates
+    return part.qd - part.qd_des
+
+
+def shared_unit(log: Log) -> str:
+    """Returns the unit of the coordinates that the sites share, and of their errors.
+
+    It is "rad" for joint angles, "m" for positions and "m, rad" for poses of end effectors.
+
+    Args:
+        log: The log of the run.
+    """
+    first_site = log.sites[0]
+    space = log.scenario.sites[first_site].task.space
+    if space == "joints":
+        return "rad"
+    return "m" if space == "position" else "m, rad"
+
+
+def sample_ages_ms(log: Log, site: str) -> Array:
+    """Returns the age of each peer's sample in use, in ms.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+
+    Returns:
+        Ages, shape (K, N - 1), with a column for each peer. NaN before a peer's first sample.
+    """
+    part = log[site]
+    columns = []
+    for peer in part.peers:
+        rate_hz = log.scenario.sites[peer].rate_hz
+        columns.append(part.age_s(peer, rate_hz) * 1e3)
+    shape = (len(part.peers), len(part))
+    return np.array(columns).reshape(shape).T
+
+
+def sites_with_operator(log: Log) -> list[str]:
+    """Lists the sites at which somebody may act on the arm.
+
+    They have an operator in the scenario, or recorded external torques.
+
+    Args:
+        log: The log of the run.
+    """
+    sites = []
+    for site in log.sites:
+        has_hands = bool(log.scenario.sites[site].hands)
+        if has_hands or np.any(log[site].tau_x):
+            sites.append(site)
+    return sites
+
+
+class _DecimatedTrace(NamedTuple):
+    """Signals reduced to few points, so that they can be drawn quickly.
+
+    A gap in the records that would be visible is marked by a row of NaN, which interrupts the
+    curve.
+
+    Attributes:
+        tick: Ticks of the P points, shape (P,).
+        t_s: Times of the points, shape (P,), in s.
+        values: Values of the C signals, shape (P, C).
+    """
+
+    tick: Ints
+    t_s: Array
+    values: Array
+
+
+def extreme_rows(values: Array, buckets: int) -> Ints:
+    """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
+
+    The rows are divided into intervals with equal numbers of rows (buckets). In each bucket the
+    rows with the largest and the smallest value of each column are kept. The first and the last
+    row are kept as well. NaN is never an extreme. A bucket in which a column is NaN throughout
+    keeps its first row.
+
+    Args:
+        values: The signals in columns, shape (K, C).
+        buckets: Number of buckets.
+
+    Returns:
+        Indices of the rows.
+    """
+    rows, columns = values.shape
+    if rows <= 2 * buckets or not columns:
+        return np.arange(rows)
+
+    # The negated floor division rounds up.
+    size = -(-rows // buckets)
+    filled_buckets = -(-rows // size)
+    # the last bucket is filled up with its last row, which changes no extreme
+    filled_rows = np.arange(filled_buckets * size)
+    valid_rows = np.minimum(filled_rows, rows - 1)
+    index = valid_rows.reshape(-1, size)
+    bucket = np.arange(filled_buckets)
+
+    ends = np.array([0, rows - 1])
+    keep = [ends]
+    for column in range(columns):
+        block = values[index, column]
+        missing = np.isnan(block)
+        above_missing = np.where(missing, np.inf, block)
+        below_missing = np.where(missing, -np.inf, block)
+        lowest = above_missing.argmin(1)
+        highest = below_missing.argmax(1)
+        keep.append(index[bucket, lowest])
+        keep.append(index[bucket, highest])
+    return np.unique(np.concatenate(keep))
+
+
+def decimate(
+    tick: Ints,
+    t_s: Array,
+    values: Array,
+    buckets: int,
+) -> _DecimatedTrace:
+    """Reduces signals to the points that a plot needs, so that no peak gets lost.
+
+    The time is divided into buckets, of which each keeps at most 2 C + 3 points for C columns,
+    among them the extremes of each column. One bucket per pixel of a plot is enough.
+
+    Args:
+        tick: Ascending ticks, shape (K,).
+        t_s: Their nominal times, shape (K,), in s.
+        values: The signals in columns, shape (K, C).
+        buckets: Number of buckets.
+    """
+    if not len(tick):
+        return _DecimatedTrace(tick, t_s, values)
+
+    # narrower gaps are narrower than a pixel, and there may be thousands of them
+    ticks = tick[-1] - tick[0]
+    bucket_ticks = max(1.0, ticks / buckets)
+    before_gap = np.flatnonzero(np.diff(tick) > bucket_ticks)
+    after_gap = before_gap + 1
+    beside_gaps = np.concatenate([before_gap, after_gap])
+    keep = np.union1d(extreme_rows(values, buckets), beside_gaps)
+
+    # the row of NaN is one period after the last record before the gap
+    gap_ticks = tick[after_gap] - tick[before_gap]
+    gap_s = t_s[after_gap] - t_s[before_gap]
+    period_s = gap_s / gap_ticks
+    nan_position = np.searchsorted(keep, before_gap) + 1
+    nan_tick = tick[before_gap] + 1
+    nan_t_s = t_s[before_gap] + period_s
+    kept_values = values[keep]
+    return _DecimatedTrace(
+        tick=np.insert(tick[keep], nan_position, nan_tick),
+        t_s=np.insert(t_s[keep], nan_position, nan_t_s),
+        values=np.insert(kept_values, nan_position, np.nan, axis=0),
+    )

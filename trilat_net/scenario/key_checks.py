@@ -1,0 +1,302 @@
+"""Checks of the values of a scenario's keys, and of the lengths of its vectors.
+
+A scenario is a TOML file that describes an experiment with several robot arms. `fields` has the
+types of its tables. The functions of this module check what these types do not state, for
+example how many numbers a vector needs for the arm of its site.
+
+Invariant:
+    - An error names the path of the key as the author of the scenario wrote it. For an unknown
+      name it suggests the most similar valid name.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple, TypeGuard, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+from ..core.arms.chain import LINK_PARAMETERS
+from ..core.arms.two_link_arm import JOINTS, PARAMETERS
+from ..errors import ScenarioError, count_nouns, suggest_nearest
+from ..fields import WITHOUT_QUOTES, KeyProblem, TomlTable
+
+StructType = type[msgspec.Struct]
+
+
+class VectorCounts(NamedTuple):
+    """How many numbers the vectors of a site have, which depends on its arm.
+
+    A scenario may state one number where a vector is needed. The counts say how long the vector
+    becomes, and check vectors that are given in full.
+
+    Attributes:
+        joints: Length of a vector with one number per joint.
+        parameters: Length of a vector with one number per dynamic parameter of the arm.
+        axes: Length of a vector with one number per axis of space: 2 in a plane, otherwise 3.
+        shared: Length of a vector with one number per coordinate that the sites exchange, for
+            example per joint or per axis of the end effector.
+    """
+
+    joints: int = JOINTS
+    parameters: int = PARAMETERS
+    axes: int = 2
+    shared: int = JOINTS
+
+    @classmethod
+    def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
+        """Returns the lengths of the vectors for an arm that is a serial chain in space.
+
+        Args:
+            joints: Number of joints of the arm.
+            shared: Number of coordinates that the sites exchange. 0 stands for the number of
+                joints.
+        """
+        return cls(
+            joints=joints,
+            parameters=LINK_PARAMETERS * joints,
+            axes=3,
+            shared=shared or joints,
+        )
+
+
+@cache
+def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
+    """Finds which keys of a table are vectors, and on which count the length of each depends.
+
+    The fields of a structure type are the keys of a table in a scenario. The length of a vector
+    depends on the arm, for example on its number of joints. The annotation of its field says
+    so: a field `Kd: Annotated[tuple[float, ...], Meta(extra={"per": "joints"})]` has one number
+    per joint, and its entry in the result is `"Kd": "joints"`.
+
+    Args:
+        kind: The structure type of the table.
+        extra: Which vectors are searched for, as a key of `Meta.extra`. "per" for vectors that
+            a single number may stand for. "point" for points in space, which must be written in
+            full.
+
+    Returns:
+        For each vector, by its key, the name of the field of `VectorCounts` with its length.
+    """
+    count_names = {}
+    for key, hint in get_type_hints(kind, include_extras=True).items():
+        # Only a type of the form `Annotated[type, ...]` has this attribute.
+        for annotation in getattr(hint, "__metadata__", ()):
+            values = annotation.extra if isinstance(annotation, Meta) else None
+            if values is not None and extra in values:
+                count_names[key] = str(values[extra])
+    return count_names
+
+
+def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
+    """Expands single numbers to vectors of the length that the arm needs.
+
+    For example, `Kd = 5` becomes one 5 per joint. The same holds for a distribution such as
+    `{ uniform = [1, 2] }`. A missing vector gets the default of its type, with the right
+    length.
+
+    Args:
+        table: A table of a scenario.
+        kind: Type of the table.
+        counts: Lengths of the vectors of the site.
+
+    Returns:
+        The table with these vectors. Other keys are unchanged.
+    """
+    lengths: dict[str, int] = {}
+    for key, per in _vector_keys(kind, "per").items():
+        lengths[key] = getattr(counts, per)
+    expanded: TomlTable = {}
+    for field in msgspec.structs.fields(kind):
+        name = field.name
+        if name in lengths and isinstance(field.default, tuple):
+            expanded[name] = [field.default[0]] * lengths[name]
+    for key, value in table.items():
+        is_single = is_number(value) or is_distribution(value)
+        if key in lengths and is_single:
+            expanded[key] = [value] * lengths[key]
+        else:
+            expanded[key] = value
+    return expanded
+
+
+_OWNERS = {
+    **dict.fromkeys(("joints", "parameters"), "the arm has"),
+    "axes": "the space of the arm has",
+    "shared": "sites share",
+}
+
+
+_SINGULAR = {
+    "joints": "joint",
+    "parameters": "parameter",
+    "axes": "axis",
+    "shared": "coordinate that the sites share",
+}
+
+
+def describe_wrong_type(value: Any, expected: str) -> str:
+    """Returns the problem of a value of a scenario that has the wrong type.
+
+    Args:
+        value: The value as it was read from TOML.
+        expected: What the value would have to be, such as "a number".
+
+    Returns:
+        The problem, such as "expected a number, got text", as the end of a sentence about the
+        key.
+    """
+    if isinstance(value, str):
+        return f"expected {expected}, got text{WITHOUT_QUOTES}"
+    if isinstance(value, bool):
+        return f"expected {expected}, got true or false"
+    if isinstance(value, dict):
+        return f"expected {expected}, got a table"
+    return f"expected {expected}, got {value!r}"
+
+
+def find_count_problem(
+    table: TomlTable, kind: StructType, counts: VectorCounts
+) -> KeyProblem | None:
+    """Finds the first vector of a table that is no list, or has too few or too many numbers.
+
+    The table is one that `expand_vectors` returned, in which a single number is a list already.
+
+    Args:
+        table: A table of a scenario.
+        kind: Type of the table.
+        counts: Lengths of the vectors of the site.
+
+    Returns:
+        The key and the problem. None if all vectors have the right lengths.
+    """
+    expandable = _vector_keys(kind, "per")
+    points = _vector_keys(kind, "point")
+    for key, per in {**expandable, **points}.items():
+        required = getattr(counts, per)
+        value = table.get(key)
+        if key not in table or value is None:
+            continue
+        noun = "coordinates" if per == "shared" else per
+        if not isinstance(value, list | tuple):
+            if key in expandable:
+                expected = f"a number, or a list with one for each {_SINGULAR[per]}"
+            else:
+                expected = f"a list with one number for each {_SINGULAR[per]}"
+            return KeyProblem(key, describe_wrong_type(value, expected))
+        if len(value) == required:
+            continue
+        numbers = count_nouns(len(value), "number")
+        return KeyProblem(key, f"has {numbers}, and {_OWNERS[per]} {required} {noun}")
+    return None
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Returns True if a value of a scenario is a number.
+
+    The values true and false are not numbers, although they are integers in Python.
+
+    Args:
+        value: A value as it was read from TOML.
+    """
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def is_distribution(value: Any) -> bool:
+    """Returns True if a value of a scenario is a distribution in place of a number.
+
+    Each run draws the number from the distribution, for example `{ uniform = [1, 2] }`.
+
+    Args:
+        value: A value as it was read from TOML.
+    """
+    if not isinstance(value, dict):
+        return False
+    return "normal" in value or "uniform" in value
+
+
+def check_keys(
+    table: Any, valid: Sequence[str], path: str, elsewhere: Sequence[str] = ()
+) -> TomlTable:
+    """Checks that a value of a scenario is a table that contains only valid keys.
+
+    Args:
+        table: A value of a scenario.
+        valid: The keys that the table may have.
+        path: Dotted path of the table, for errors.
+        elsewhere: Dotted paths of keys in other tables, which the user may have meant.
+
+    Returns:
+        The table, unchanged.
+
+    Raises:
+        ScenarioError: The value is not a table, or has an unknown key.
+    """
+    if not isinstance(table, dict):
+        raise ScenarioError("must be a table", path=path)
+    for key in table:
+        if key in valid:
+            continue
+        key_path = f"{path}.{key}" if path else key
+        hint = suggest_nearest(key, valid, elsewhere)
+        if not hint:
+            choices = ", ".join(valid)
+            hint = f"; valid keys are {choices}"
+        raise ScenarioError(f"unknown key{hint}", path=key_path)
+    return table
+
+
+def field_names(kind: StructType) -> tuple[str, ...]:
+    """Returns the keys that a table of a scenario may have.
+
+    Args:
+        kind: Type of the table.
+    """
+    return kind.__struct_encode_fields__
+
+
+def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
+    """Checks that a word of a scenario is among the valid ones.
+
+    Args:
+        word: A value of a scenario.
+        valid: The valid words.
+        path: Dotted path of the key, for errors.
+
+    Raises:
+        ScenarioError: The word is not valid. The message suggests a similar one.
+    """
+    if word not in valid:
+        quoted = [repr(choice) for choice in valid]
+        choices = ", ".join(quoted)
+        hint = suggest_nearest(str(word), valid)
+        raise ScenarioError(f"is {word!r}, but must be one of {choices}{hint}", path=path)
+
+
+def check_finite(value: Any, path: str) -> None:
+    """Checks that all numbers of a scenario's value are finite and fit into 64 bits.
+
+    Numbers that are infinite, NaN, or integers of more than 64 bits are refused. Tables and
+    lists are checked with everything that they contain.
+
+    Args:
+        value: A value of a scenario.
+        path: Dotted path of the key, for errors.
+
+    Raises:
+        ScenarioError: A number is refused. The error has the path of its key.
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ScenarioError(f"must be a finite number, but is {value}", path=path)
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        length = value.bit_length()
+        problem = f"must be an integer of at most 64 bits, but has {length} bits"
+        raise ScenarioError(problem, path=path)
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            entry_path = f"{path}.{key}" if path else key
+            check_finite(entry, entry_path)
+    if isinstance(value, list):
+        for n, entry in enumerate(value):
+            check_finite(entry, f"{path}[{n}]")

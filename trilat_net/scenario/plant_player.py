@@ -1,0 +1,237 @@
+"""Runs a user's plant: a class that computes the motion of an arm and of other bodies.
+
+A plant takes the place of the built-in simulation of an arm. At each tick, a period of the
+control loop, it receives the torque of the control law and returns the new state of the arm.
+
+Invariant:
+    - The state that a plant returns is treated as a measurement, like the state of a real
+      robot. The log stores it as the joint positions q, the joint velocities qd and the
+      external torques tau_x. Therefore the control can be executed again from a log without the
+      plant, and no check of a log judges the motion of the plant.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from ..core.step.ticks import PlantState
+from ..core.step.vectors import Array
+from ..errors import PlantFailed, ScenarioError, count_nouns, describe_exception
+from ..own_code.class_arguments import make_own_instance
+from ..own_code.imported_code import CodeKey, Watch, call_directly, import_class
+from .own_plant import OwnPlant
+from .scenario_types import Scenario
+
+T = TypeVar("T")
+_POSE_NUMBERS = 7
+"""Number of values of a pose: three for the position, four for the quaternion."""
+
+
+class PlantContext(NamedTuple):
+    """Facts that a user's plant receives when it is created.
+
+    >>> class Scene:
+    ...     def __init__(self, facts: tn.PlantContext) -> None:
+    ...         self.arm = tn.SimulatedArm(facts.scenario, facts.site)
+    ...     def step(self, tau, h_s):
+    ...         self.arm.move(tau, h_s)
+    ...         return self.arm.q, self.arm.qd
+
+    Attributes:
+        site: Name of the site whose arm the plant moves.
+        scenario: The experiment, with its arms, start poses and tick rates.
+        q0_rad: Start pose of the arm, in rad, shape (n,).
+        h_s: Duration of a tick, in s.
+        seed: Seed for random numbers of the plant. It depends on the scenario's seed and the
+            site.
+        bodies_m: Extents of the bodies that the plant moves in addition to the arm, by name,
+            along their own axes x, y and z, in m.
+    """
+
+    site: str
+    scenario: Scenario
+    q0_rad: tuple[float, ...]
+    h_s: float
+    seed: int
+    bodies_m: Mapping[str, tuple[float, float, float]]
+
+
+class _PlantProgram(Protocol):
+    """Interface of a user's plant: a program that computes the motion of an arm.
+
+    The user's class is called with a `PlantContext` as its first argument, and with its
+    settings by name.
+    """
+
+    def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
+        """Advances the plant by one period under a constant control torque.
+
+        Args:
+            tau: Control torque ON the joints, in N m, shape (n,).
+            h_s: Duration of the period, in s.
+
+        Returns:
+            q in rad and qd in rad/s at the end of the period. A plant that knows the torque of
+            contacts also returns tau_x in N m, with the sign of Eq. (8): the negative of the
+            torque ON the arm.
+        """
+
+    def poses(self) -> Sequence[Sequence[float]]:
+        """Returns the current poses of the bodies, in the order of `PlantContext.bodies_m`.
+
+        This method is called only if the plant has bodies.
+
+        Returns:
+            Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
+            m, and the quaternion w, x, y, z.
+        """
+
+
+class PlantPlayer:
+    """Runs a user's plant at its site, tick by tick.
+
+    A plant is a program that computes the motion of an arm from the torques of its motors.
+
+    Args:
+        scenario: The scenario.
+        site: Name of the site.
+        plant: Table of the plant.
+        watch: Function that calls the code of the plant, for example with a time limit.
+
+    Attributes:
+        state: State of the arm and the bodies in the next tick.
+        rate_hz: Tick rate of the site, in Hz.
+
+    Raises:
+        ScenarioError: The class cannot be used, or lacks a method.
+        PlantFailed: The first poses of the bodies are not valid.
+    """
+
+    def __init__(
+        self, scenario: Scenario, site: str, plant: OwnPlant, watch: Watch = call_directly
+    ) -> None:
+        spec = scenario.sites[site]
+        path = f"sites.{site}.plant"
+        self._site = site
+        self._code = plant.code
+        self._watch = watch
+        self.rate_hz = spec.rate_hz
+        kind = import_class(CodeKey.of(plant), path, plant.method)
+        if plant.bodies and not hasattr(kind, "poses"):
+            raise ScenarioError(
+                f"{plant.code} has no method poses(), which must return the poses of the "
+                "bodies",
+                path=f"{path}.bodies",
+            )
+        context = PlantContext(
+            site=site,
+            scenario=scenario,
+            q0_rad=spec.q0_rad,
+            h_s=1.0 / spec.rate_hz,
+            seed=scenario.draw_seed(site),
+            bodies_m=plant.bodies,
+        )
+        self._program: _PlantProgram = make_own_instance(
+            kind, plant.code, context, plant.settings, path
+        )
+        self._body_count = len(plant.bodies)
+        bodies = self._call(0, self._read_poses)
+        self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
+
+    def move(self, tick: int, tau: Sequence[float]) -> None:
+        """Lets the plant compute the motion of the arm from a tick to the next one.
+
+        The result is stored in `state`.
+
+        Args:
+            tick: Number of the tick that has been executed.
+            tau: Control torque of this tick, in N m, shape (n,).
+
+        Raises:
+            PlantFailed: The plant raised an error, or returned a state with wrong lengths or
+                numbers that are not finite.
+        """
+        vectors = self._call(tick, lambda: self._step(tau))
+        for name, vector in zip(("q", "qd", "tau_x"), vectors, strict=False):
+            if len(vector) != len(tau):
+                raise self._make_error(
+                    tick,
+                    f"{name} has {count_nouns(len(vector), 'number')}, and the arm "
+                    f"has {count_nouns(len(tau), 'joint')}",
+                )
+            if not all(map(math.isfinite, vector)):
+                raise self._make_error(tick, f"{name} is {vector}, which is not finite")
+
+        bodies = self._call(tick, self._read_poses)
+        q, qd, *contact_torques = vectors
+        tau_x = contact_torques[0] if contact_torques else ()
+        self.state = PlantState(q, qd, tau_x, bodies)
+
+    def _step(self, tau: Sequence[float]) -> list[list[float]]:
+        """Returns q, qd and, if the plant returns it, tau_x after one period."""
+        q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
+        vectors = [q, qd, *others[:1]]
+        return [[float(number) for number in vector] for vector in vectors]
+
+    def _read_poses(self) -> list[float]:
+        """Returns the poses of all bodies as one list, with seven numbers per body.
+
+        Raises:
+            ValueError: The plant returned another number of poses, or numbers that are not
+                finite.
+        """
+        if not self._body_count:
+            return []
+        poses = [[float(number) for number in pose] for pose in self._program.poses()]
+        if [len(pose) for pose in poses] != [_POSE_NUMBERS] * self._body_count:
+            raise ValueError(
+                f"poses() returned {poses} instead of seven numbers for each of "
+                f"{count_nouns(self._body_count, 'body')}"
+            )
+        numbers = [number for pose in poses for number in pose]
+        if not all(map(math.isfinite, numbers)):
+            raise ValueError(f"poses() returned {poses}, which is not finite")
+        return numbers
+
+    def _call(self, tick: int, function: Callable[[], T]) -> T:
+        """Calls the code of the plant, and returns the result.
+
+        Args:
+            tick: Tick, for the error message.
+            function: The call.
+
+        Raises:
+            PlantFailed: The code raised an error.
+        """
+        try:
+            result: T = self._watch(tick, function)
+            return result
+        # The user's code may raise anything.
+        except (Exception, SystemExit) as error:
+            raise self._make_error(tick, describe_exception(error)) from error
+
+    def _make_error(self, tick: int, problem: str) -> PlantFailed:
+        """Returns the error that reports a problem of the plant in a tick."""
+        return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
+
+
+def make_plant_players(scenario: Scenario) -> dict[str, PlantPlayer]:
+    """Creates the users' plants of all sites that have one.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        An object that runs the plant, by the name of the site. Empty if no site has a plant.
+
+    Raises:
+        CodeWithheld: A class may not run.
+        ScenarioError: A plant cannot be created.
+    """
+    return {
+        name: PlantPlayer(scenario, name, spec.plant)
+        for name, spec in scenario.sites.items()
+        if isinstance(spec.plant, OwnPlant)
+    }
