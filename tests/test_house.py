@@ -48,7 +48,7 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 288,
+    "kernel": 326,
     "session": 297,
     "analysis": 120,
     "app": 68,
@@ -62,6 +62,8 @@ TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
 
 CALLED_BY_LIBRARIES = {
     "FencedExamples.on_object",
+    "LaneVector.can_convert_from",
+    "LaneVector.unify",
     "_CompilingNotice.on_end",
     "_CompilingNotice.on_start",
     "_CompressedFiles._load_data",
