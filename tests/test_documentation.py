@@ -65,6 +65,13 @@ def test_every_formula_becomes_mathml(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
+def test_no_formula_breaks_its_table(page: str) -> None:
+    """A bar would end the cell: GitHub and Zensical want the command for it, as in \\lvert x \\rvert."""
+    rows = re.findall(r"^\|.*$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert not [row for row in rows if "|" in "".join(re.findall(r"\$`([^`]+)`\$", row))]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_a_command_parses_as_it_is_written(page: str) -> None:
     for block in find_blocks(page):
         for words, _ in read_commands(block.text) if block.language == "sh" else ():
