@@ -110,7 +110,7 @@ def test_a_formula_has_the_spaces_of_tex() -> None:
     assert formula.count('lspace="0" rspace="0">&#x0007C;</mo>') == 2
 
 
-def test_a_formula_keeps_its_punctuation_and_scrolls_if_long() -> None:
+def test_formula_keeps_punctuation_and_scrolls_if_long() -> None:
     short, long = (
         MAKE.typeset_in_line("+".join("a" * count), before="(", after=").") for count in (3, 30)
     )
