@@ -25,6 +25,7 @@ Invariant:
 import hashlib
 import os
 import pickle
+import re
 import sys
 import zlib
 from collections.abc import Callable
@@ -35,7 +36,7 @@ from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
-from llvmlite.binding import parse_bitcode
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import event, types
 from numba.core.caching import (
     CompileResultCacheImpl,
@@ -527,11 +528,31 @@ class _LeafCompiler(Compiler):
         return result
 
 
-class _LaneLibrary(_LeafLibrary):
-    """The code of a function of lanes, which computes a tick of several runs side by side.
+def _prefer_wide_vectors(llvm_code: str) -> str:
+    """Adds to all functions of a module that loops should use vectors of 512 bits.
 
-    All functions that it calls are inlined, because the compiler turns a loop over runs into
-    vector instructions only if the loop contains no calls.
+    By default LLVM chooses 256 bits even if a processor has longer registers, because some
+    processors lower their clock rate for these. Arithmetic gains more than that. Processors
+    without such registers are not affected. llvmlite cannot set an attribute that has a value.
+
+    Args:
+        llvm_code: The module as text.
+    """
+    # The attributes of a function follow its arguments, and a mark of addresses.
+    return re.sub(
+        r"^(define .*\)(?: (?:local_)?unnamed_addr)?)(?=[^()]*\{$)",
+        r'\1 "prefer-vector-width"="512"',
+        llvm_code,
+        flags=re.MULTILINE,
+    )
+
+
+class _LaneLibrary(_LeafLibrary):
+    """The code of a function with a long loop, or of a function of lanes.
+
+    A function of lanes computes a tick of several runs side by side. All leaves that the
+    function calls are inlined, because the compiler turns a loop into vector instructions only
+    if the loop contains no calls.
     """
 
     def _optimize_final_module(self) -> None:
@@ -539,7 +560,14 @@ class _LaneLibrary(_LeafLibrary):
             # The names of the function itself and of its wrapper contain the library's name.
             if not function.is_declaration and self.name not in function.name:
                 function.add_function_attribute("alwaysinline")
+        self._final_module = parse_assembly(_prefer_wide_vectors(str(self._final_module)))
         super()._optimize_final_module()
+
+
+class _LoopCompiler(_LeafCompiler):
+    """Compiles a function with a long loop, into whose code all leaves are inlined."""
+
+    library_class = _LaneLibrary
 
 
 class _LaneCompiler(_LeafCompiler):
@@ -553,12 +581,17 @@ class _LaneCompiler(_LeafCompiler):
 
 
 def _is_in_lanes(numba_type: Any) -> bool:
-    """Returns True if a value is a row of several runs side by side.
+    """Returns True if a value is a row of several runs side by side, or contains such values.
 
     Args:
         numba_type: Numba's type of the value. A type of rows in lanes has the attribute
             `in_lanes`.
     """
+    if isinstance(numba_type, types.Array):
+        return _is_in_lanes(numba_type.dtype)
+    if isinstance(numba_type, types.BaseTuple):
+        entry_types: Any = numba_type
+        return any(map(_is_in_lanes, entry_types.types))
     return bool(getattr(numba_type, "in_lanes", False))
 
 
@@ -712,6 +745,15 @@ def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Calla
     return cast(Callable[P, R], dispatcher)
 
 
+def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
+    """Marks a function with a long loop that calls other leaves (decorator).
+
+    All leaves that the loop calls become part of its code. This saves the time in which the
+    descriptions of arrays are passed to them. Python calls the function like any other leaf.
+    """
+    return leaf(function) if _config.DISABLE_JIT else _make_leaf(function, _LoopCompiler)
+
+
 def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Marks a function that computes one stage of several runs, a lane for each (decorator).
 
@@ -724,17 +766,45 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
     return _make_leaf(function, _LaneCompiler)
 
 
+@cache
+def _make_unstored(function: Callable[..., Any]) -> Any:
+    """Returns Numba's dispatcher of a function of lanes whose code is not stored on disk."""
+    dispatcher: Any = _make_leaf(function, _LaneCompiler)
+    dispatcher._cache = NullCache()
+    return dispatcher
+
+
 def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
     """Compiles a function of lanes, or loads its code, and returns the address of its code.
+
+    The code is not stored on disk if the attribute `is_stored` of some type is False.
 
     Args:
         function: A function with the decorator `lane_leaf`.
         argument_types: Numba's types of its arguments.
     """
     dispatcher: Any = function
+    is_stored = all(getattr(kind, "is_stored", True) for kind in argument_types)
+    if not is_stored:
+        dispatcher = _make_unstored(dispatcher.py_func)
     dispatcher.compile(argument_types)
     result = dispatcher.overloads[argument_types]
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+
+
+def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
+    """Returns True if a function of lanes need not be compiled any more.
+
+    Args:
+        function: A function with the decorator `lane_leaf`.
+        argument_types: Numba's types of its arguments.
+    """
+    dispatcher: Any = function
+    if argument_types in dispatcher.overloads:
+        return True
+    stored = dispatcher._cache
+    key = stored._index_key(argument_types, dispatcher.targetctx.codegen())
+    return key in stored._cache_file._load_index()
 
 
 def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
@@ -746,8 +816,7 @@ def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, 
     """
     dispatcher: Any = function
     # Numba has no text of code from the cache.
-    compiled: Any = _make_leaf(dispatcher.py_func, _LaneCompiler)
-    compiled._cache = NullCache()
+    compiled = _make_unstored(dispatcher.py_func)
     compiled.compile(argument_types)
     return str(compiled.overloads[argument_types].library.get_asm_str())
 
