@@ -118,7 +118,10 @@ class GapRepair:
 
     @property
     def progress_ns(self) -> int:
-        """Time at which the last missing message arrived, on the monotonic clock, in ns."""
+        """Time at which the last missing message arrived, on the monotonic clock, in ns.
+
+        If it lies long ago, the site probably has no more of them.
+        """
         return self._progress_ns
 
     def probe(self) -> None:

@@ -616,7 +616,7 @@ def _start_certificate(
 
 
 def _encode(certificate: x509.Certificate) -> bytes:
-    """Returns a certificate in PEM format."""
+    """Returns a certificate in PEM format, in which Zenoh reads it."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 

@@ -323,7 +323,7 @@ class Membership:
 
     @property
     def local_info(self) -> Info:
-        """Identity of this member, as it is sent to the other members."""
+        """Identity of this member, as it replies to queries of other members."""
         return self._publisher.info
 
     @property

@@ -468,7 +468,10 @@ class SlewedOffset:
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """Latest estimate, which the smoothed offset approaches or has reached already."""
+        """Latest estimate of the offset.
+
+        The smoothed offset moves towards it, or has reached it.
+        """
         return self._segment.estimate
 
     @property

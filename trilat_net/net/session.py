@@ -152,7 +152,7 @@ class SessionJoin:
 
     @property
     def _info(self) -> Info:
-        """Identity of this member."""
+        """Identity of this member, as other members get it: its boot, scenario and clock."""
         return self._publisher.info
 
     def poll(self) -> Epoch | None:

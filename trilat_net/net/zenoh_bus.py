@@ -155,11 +155,15 @@ class _ZenohQuery(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """Payload of the query. Empty if there is none."""
+        """Content of the query, for example a request. Empty if the query has no content."""
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def reply(self, payload: bytes) -> None:
-        """Replies to the query. Each query can be replied to once."""
+        """Replies to the query, which then ends for its sender. A query can be answered once.
+
+        Args:
+            payload: The encoded reply.
+        """
         # A query ends for its sender only when the query object is dropped.
         with self.query as query:
             query.reply(self.key, payload)

@@ -171,10 +171,7 @@ class _CompilingNotice(event.Listener):
             self.report(COMPILING)
 
     def on_end(self, _: Any) -> None:
-        """Restores the handlers of signals that were in force before a compilation.
-
-        Numba calls it.
-        """
+        """Restores the handlers of signals when Numba reports the end of a compilation."""
         restore = self._restorers.pop()
         restore()
 

@@ -159,7 +159,22 @@ def _has_room(
     rules: Any,
     rooms: IntArray,
 ) -> bool:
-    """Returns False if a calendar must become longer first, see `CalendarSizer.make_room`."""
+    """Returns False if a calendar must become longer before the arrivals of a tick are written.
+
+    A calendar is the ring buffer of a link with a page per tick, in which samples wait.
+    Compiled code cannot enlarge it. The loop then ends, and `Site.step` executes the tick. The
+    rule is that of `CalendarSizer.make_room`.
+
+    Args:
+        k: The tick.
+        first: Index of the first arrival of the tick.
+        last: Index after its last arrival.
+        arrivals: Peer and tick of each arrival, see `RecordedRows.arrivals`.
+        links: Rows of the links.
+        pages: Number of pages of each calendar.
+        rules: Properties of the site, a `TickRules`.
+        rooms: See `SiteViews.rooms`; updated.
+    """
     for n in range(first, last):
         peer = arrivals[n, 0]
         tick = arrivals[n, 1]
@@ -179,7 +194,19 @@ def _has_room(
 def _put_arrivals(
     first: int, last: int, arrivals: IntArray, samples: IntArray, rules: Any, views: Any
 ) -> int:
-    """Writes the arrivals of a tick into its buffers, and returns their CRC-32."""
+    """Writes the arrivals of a tick into its buffers, as `Site.step` does.
+
+    Args:
+        first: Index of the first arrival of the tick.
+        last: Index after its last arrival.
+        arrivals: Peer, tick and sample of each arrival, see `RecordedRows.arrivals`.
+        samples: Table of the samples, as words.
+        rules: Properties of the site, a `TickRules`.
+        views: Memory of the site, a `SiteViews`; its arrivals are written.
+
+    Returns:
+        The CRC-32 of the arrivals, which the record must have, too.
+    """
     m = rules.shared
     crc = _ALL_BITS
     for n in range(first, last):
@@ -203,7 +230,17 @@ def _put_arrivals(
 
 @leaf
 def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
-    """Writes what a live hand did, and the measured motion of an external arm."""
+    """Writes the other inputs of a tick: a live hand's action, and an external arm's motion.
+
+    A live hand is a person or program that moved the arm. Without such a hand, and for an arm
+    that the site simulates, nothing is written.
+
+    Args:
+        row: Index of the record.
+        arrays: Arrays of the site; changed.
+        rows: The records, a `RecordedRows`.
+        rules: Properties of the site, a `TickRules`.
+    """
     if rules.hand >= 0:
         hand = arrays.actors[rules.hand]
         coordinates = (rows.hands.shape[1] - 1) // 2
@@ -224,7 +261,19 @@ def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
 def _equals_record(
     row: int, crc: int, arrays: SiteArrays, rows: Any, rules: Any, views: Any
 ) -> bool:
-    """Returns True if the results of a tick have the same bits as its record."""
+    """Returns True if the results of a tick have the same bits as its record.
+
+    The mode, the checksum of the arrivals, the samples in use, all numbers, and the memory
+    between ticks are compared.
+
+    Args:
+        row: Index of the record.
+        crc: CRC-32 of the arrivals of the tick.
+        arrays: Arrays of the site after the tick.
+        rows: The records, a `RecordedRows`.
+        rules: Properties of the site, a `TickRules`.
+        views: The same memory of the site as words, a `SiteViews`.
+    """
     s: SiteRow = arrays.site[0]
     difference = rows.modes[row] ^ s.mode
     difference |= rows.checksums[row] ^ crc
@@ -375,13 +424,16 @@ class TickRepeater:
         return repeated
 
     def _list_arrays(self) -> list[NDArray[Any]]:
-        """Returns the arrays of the site that its ticks change."""
+        """Returns the arrays of the site that its ticks change, to save and restore them."""
         a = self._site.arrays
         changed = [a.site, a.links, a.dues, a.calendars, a.ramps, a.actors, a.chain]
         return [array for array in changed if array is not None]
 
     def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
-        """Executes ticks, see `run_recorded_ticks`."""
+        """Executes ticks with the compiled loop for the kind of arm.
+
+        The arguments and the result are those of `_run_recorded_ticks`.
+        """
         site = self._site
         self._views.rooms[:] = self._parts.calendar_sizer.list_rooms()
         run_recorded_ticks = _run_planar_ticks
@@ -401,7 +453,16 @@ class TickRepeater:
 
 
 def _view_words(array: NDArray[Any]) -> IntArray:
-    """Returns the memory of an array as integers, shape (rows, words of a row)."""
+    """Returns the memory of an array as integers, which are compared faster than floats.
+
+    No bit is copied: a change of the array changes the result.
+
+    Args:
+        array: Array of numbers of 8 bytes, or of rows of such numbers.
+
+    Returns:
+        The integers, shape (rows, words of a row).
+    """
     if not array.size:
         return np.zeros(array.shape[:2], np.int64)
     bits = array.view(np.int64)
@@ -420,7 +481,13 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the numbers of a field of a row."""
+        """Adds the places of the numbers of a field, in a row of the site or of its links.
+
+        Args:
+            dtype: Type of the row.
+            field: Name of the field.
+            row: Index of the row.
+        """
         assert dtype.fields is not None
         field_type, offset = dtype.fields[field][:2]
         first = (row * dtype.itemsize + offset) // _WORD_BYTES

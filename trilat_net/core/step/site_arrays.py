@@ -322,7 +322,11 @@ class CalendarSizer:
         self.newest[peer] = -1
 
     def list_rooms(self) -> list[tuple[int, int]]:
-        """Returns for each peer `newest`, and how many ticks a sample waits at most."""
+        """Returns the facts by which `recorded_ticks` checks whether samples fit.
+
+        Returns:
+            For each peer its entry of `newest`, and how many ticks a sample waits at most.
+        """
         waits = [
             span_ticks(delay_us * 1000, self._rate_hz) + _SLACK for delay_us in self._delay_us
         ]

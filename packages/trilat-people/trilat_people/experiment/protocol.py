@@ -633,7 +633,10 @@ def _list_pseudonyms(protocol: Protocol) -> list[str]:
 
 
 def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields a sentence for each pseudonym that two participants have, or nobody has."""
+    """Yields a sentence for each problem with the pseudonyms of participants.
+
+    Two participants have the same pseudonym, or a force limit names one that nobody has.
+    """
     names = _list_pseudonyms(protocol)
     if len(set(names)) < len(names):
         yield "two participants have the same pseudonym"

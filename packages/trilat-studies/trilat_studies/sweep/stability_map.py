@@ -80,10 +80,7 @@ class PlaneAxis(NamedTuple):
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the values are equally spaced, up to rounding.
-
-        Fewer than three values are.
-        """
+        """True if the values are equally spaced, up to rounding, or fewer than three."""
         steps = np.diff(self.values)
         if len(steps) < 2:
             return True
