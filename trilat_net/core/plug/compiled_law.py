@@ -434,7 +434,10 @@ def _explain_field(name: str, kind: str, location: str) -> str:
 
 
 def _explain_attribute(name: str, law: Any, location: str) -> str:
-    """Returns a sentence that says why a compiled law cannot use an attribute.
+    """Returns a sentence that says why a compiled law cannot use an attribute of `self`.
+
+    Only numbers and lists of numbers can be compiled. The attribute is of another type, does
+    not exist, or is a method: then the sentence says what to write instead.
 
     Args:
         name: Name of the attribute.

@@ -364,7 +364,8 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
 def list_remembered(law: Any) -> tuple[str, ...]:
     """Returns the names of the attributes that a law keeps from tick to tick.
 
-    The law's class lists them in `remembers`. Empty for a law without memory.
+    The law's class lists them in `remembers`, for example `remembers = ("x",)`. The record of
+    each tick contains their values. Empty for a law without memory.
     """
     return tuple(getattr(law, "remembers", ()))
 

@@ -151,6 +151,8 @@ def sparc(
 def path_length_m(places: ArrayLike) -> float:
     """Computes the length of a sampled path, in m, as the sum of its straight segments.
 
+    A detour or a tremor makes the path longer than the distance between its ends.
+
     Args:
         places: Positions along the path, in m, shape (K, D).
     """

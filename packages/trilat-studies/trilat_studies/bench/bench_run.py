@@ -257,7 +257,10 @@ def lengthen_run(judged: JudgedRun) -> JudgedRun:
 
 
 def _compute_longest_s(scenario: Scenario) -> float:
-    """Returns the duration at which a run reaches the safety limit `MAX_RUN_TICKS`, in s.
+    """Returns the longest duration for which a run may be extended to judge it, in s.
+
+    After this time all sites together have computed `MAX_RUN_TICKS` ticks, periods of their
+    control loops.
 
     Args:
         scenario: The scenario, whose sites have tick rates.
@@ -836,6 +839,9 @@ def _run_pending(
     progress: Progress,
 ) -> None:
     """Executes the runs that the journal lacks, and adds each to the journal when it ends.
+
+    An interrupted suite therefore continues where it was. Nothing happens if all runs are
+    there.
 
     Args:
         journal: The finished runs.

@@ -145,13 +145,13 @@ def _select_nearest(distances: Mapping[GridIndex, int], count: int) -> list[Grid
 
 
 def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
-    """Returns the sort key by which neighbouring cells beside an edge are found side by side.
+    """Returns the sort key by which neighbouring cells beside an edge come side by side.
 
     Runs of the same panel, law and seed come together. Within these, the runs are sorted by the
     two axes that a map draws. A selection at equal distances is then spread along the edge.
 
     Args:
-        index: Indices of the run along both axes, then those of panel, law and seed.
+        index: Position of the run along all axes, then its law and its seed.
     """
     return (*map(str, index[2:]), *index[:2])
 
@@ -230,9 +230,11 @@ def tabulate_confirmations(
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
-    """Returns the runs by their position in the grid.
+    """Returns the runs by their position in the grid, by which neighbours are found.
 
-    The values of an axis are numbered in rising order. Numbers come before texts.
+    The values of an axis are numbered in rising order, numbers before texts. The law and the
+    seed follow the numbers: the run with the second value of x and the first of y is at (1, 0,
+    law, seed).
 
     Args:
         rows: The runs, one mapping from columns to values per run.
