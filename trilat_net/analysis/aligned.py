@@ -113,9 +113,11 @@ class AlignedRecords(NamedTuple):
 
     @property
     def shared_rate(self) -> Array:
-        """The time derivative of the coordinates that other sites receive from this site.
+        """Velocity of the coordinates in which the sites follow each other, one row per tick.
 
-        It is qd, shape (K, n), or in task space xd, shape (K, m).
+        Sites follow each other's joint angles, or in task space the positions of their end
+        effectors. The energy terms use this velocity for both cases: it is qd, shape (K, n), in
+        rad/s, or in task space xd, shape (K, m).
         """
         return self.xd if self.x.size else self.qd
 
@@ -126,7 +128,10 @@ class AlignedRecords(NamedTuple):
 
     @property
     def t_s(self) -> Array:
-        """Nominal time of every row, shape (K,), in s."""
+        """Time of every row on the ideal grid of ticks, tick / rate_hz, shape (K,), in s.
+
+        A tick that was computed late has the same time as one that was computed punctually.
+        """
         return self._ticks / self.rate_hz
 
     @property
@@ -170,9 +175,10 @@ class AlignedRecords(NamedTuple):
 
     @property
     def known_periods(self) -> Bools:
-        """Marks the tick periods whose first and last tick both have a record.
+        """Marks the tick periods that can be judged: both of their ticks have a record.
 
-        The shape is (K - 1,), because K ticks bound K - 1 periods.
+        Energy changes between two ticks. If a record was lost, the periods before and after its
+        tick are therefore unknown. K ticks bound K - 1 periods, so that the shape is (K - 1,).
         """
         is_known_at_start = self.known[:-1]
         is_known_at_end = self.known[1:]

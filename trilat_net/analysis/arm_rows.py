@@ -64,7 +64,15 @@ B).
 
 
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
-    """Returns the product of a matrix, shape (a, b, ...), and a vector, shape (b, ...)."""
+    """Multiplies a matrix and a vector, separately for each of many records.
+
+    Args:
+        matrix: Entries of the matrices, shape (a, b, ...). The axes "..." count the records.
+        vector: Components of the vectors, shape (b, ...), with the same records.
+
+    Returns:
+        The products, shape (a, ...).
+    """
     product: Numbers = np.einsum("ab...,b...->a...", matrix, vector)
     return product
 
@@ -233,7 +241,12 @@ class PlacedArm:
         return solve_columns(M, torque - bias_torque)
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector from the base, shape (2, ...), in m."""
+        """Returns the position (x, y) of the end effector by forward kinematics, in m.
+
+        For links of the lengths l_1 and l_2, x = l_1 cos q_1 + l_2 cos(q_1 + q_2), and y has
+        sines in place of the cosines. The origin is the first joint. The shape is (2, ...),
+        with one column per record.
+        """
         l1_m, l2_m = self.lengths_m
         inner, q_2 = self.q
         outer = inner + q_2
@@ -242,7 +255,10 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian of the end effector's position, shape (2, 2, ...), in m/rad."""
+        """Returns the Jacobian J of the end effector's position: its velocity is J qd.
+
+        The shape is (2, 2, ...), in m/rad. Rows are x and y, columns are the two joints.
+        """
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
         q_1, q_2 = self.q
@@ -307,7 +323,11 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """Always None, because this arm follows joint by joint, not with its end effector."""
+        """Always None: the planar arm follows other arms joint by joint, never by end effector.
+
+        `ChainArmRows.task` has the settings of arms that do, so that callers need not
+        distinguish the two kinds of arms.
+        """
         return
 
     @property
@@ -439,7 +459,11 @@ class PlanarArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns zeros, shape (K, 2): this arm has no friction in its joints."""
+        """Returns the friction torques of the joints, which are zero here, shape (K, 2).
+
+        The method exists because `ChainArmRows` has it for chains, whose joints may have
+        friction.
+        """
         return np.zeros_like(speed)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
@@ -616,7 +640,7 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """The coordinates of the end effector with which the arm follows other arms.
+        """Settings of an arm that follows the end effectors of other arms, such as its axes.
 
         None if the arm follows other arms joint by joint.
         """
@@ -806,7 +830,11 @@ class ChainArmRows(NamedTuple):
         return position, J, energy
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the potential energy of the links against the base, shape (K,), in J."""
+        """Returns the energy of the links in the field of gravity, at joint angles `q`.
+
+        Its zero is at the height of the base. `q` has the shape (K, n), and the result the
+        shape (K,), in J.
+        """
         _, _, energy = self._place(q)
         return energy
 
@@ -1015,9 +1043,15 @@ def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
 
 
 def upright_axes(chain: ChainSetup) -> Array:
-    """Returns two horizontal unit vectors and the upward one, in the frame of the base.
+    """Returns the axes of a frame that stands upright, for drawings of the arm.
 
-    Their components are the rows of the result, shape (3, 3).
+    A URDF file may mount the base of a chain in any orientation. The direction of gravity shows
+    which way is up. Without gravity, the z axis of the base counts as up.
+
+    Returns:
+        Unit vectors forward, sideways and up as rows, in the frame of the base, shape (3, 3).
+            The product of points, shape (..., 3), and the transpose are the upright
+            coordinates.
     """
     gravity = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(gravity))

@@ -131,7 +131,10 @@ class _DelayPeriod(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True if the analysed period is the true one."""
+        """True if the analysed period is the true one, so that results for it hold for ever.
+
+        False if the analysed period is only nearly the true one, or if there is none.
+        """
         return self.span_s is not None and self.span_s == self.true_s
 
 

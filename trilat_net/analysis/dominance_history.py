@@ -201,7 +201,11 @@ def list_program_sites(log: Log) -> list[str]:
 
 
 def has_program_hand(scenario: Scenario, site: str) -> bool:
-    """Returns True if a site of a scenario has a hand of kind "own", a program of the user."""
+    """Returns True if a program of the user operates the arm of a site (a hand of kind "own").
+
+    Such a program may react to the motion of the arm. A linearised loop does not contain this
+    reaction, unlike that of an operator whom the scenario describes.
+    """
     return any(isinstance(hand, ProgramHand) for hand in scenario.sites[site].hands)
 
 

@@ -62,7 +62,10 @@ class _PredictedDelivery(NamedTuple):
 
     @property
     def lost(self) -> Bools:
-        """True for samples that the link loses, shape (M,)."""
+        """Marks the samples that the delay model of the link loses on purpose, shape (M,).
+
+        A receiver must not expect these samples, so that they do not count as missing.
+        """
         lost: Bools = self.due_ns == LOST
         return lost
 
@@ -349,7 +352,10 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True if sender and receiver read the same clock, as they run on one machine."""
+        """True if sender and receiver run on one machine and thus read the same clock.
+
+        The text of a link then leaves out its clock, because no offset had to be estimated.
+        """
         return self.bound_max_us == 0 and self.offset_us == 0
 
 
@@ -465,12 +471,16 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link as in scenarios, for example "m1->s" from peer m1 to site s."""
+        """Name of the link as in scenarios: "m1->s" for samples that m1 sends to s."""
         return f"{self.peer}->{self.site}"
 
     @property
     def plain(self) -> bool:
-        """True if the link did nothing but delay every sample by the same time."""
+        """True if the link only delayed every sample by one constant time.
+
+        No sample of such a link was late, missing or lost, so that a line of text says
+        everything about the link.
+        """
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
         return is_as_stated and has_one_constant_delay(self.stated)

@@ -90,7 +90,11 @@ MIN_SIGN_CHANGES = 6
 
 
 class Stability(StrEnum):
-    """The stability judgement of a run. The value of each member is the word for people."""
+    """The four judgements of a run. The value of each member is the word for people.
+
+    STABLE needs a proof that the run does not contradict. SETTLED means that the motion came to
+    rest or decays, without a proof. OPEN means that the findings do not decide.
+    """
 
     STABLE = "stable"
     SETTLED = "settled"
@@ -101,7 +105,8 @@ class Stability(StrEnum):
 class EndBehaviour(StrEnum):
     """How the arms move at the end of a run, from the best to the worst behaviour.
 
-    The value of each member is a phrase for the user.
+    The order matters: the worst joint decides about the run. `stability` translates the
+    behaviour to a judgement. The value of each member is a phrase for the user.
     """
 
     CONVERGED = "converged"
@@ -116,9 +121,11 @@ class EndBehaviour(StrEnum):
 
     @property
     def stability(self) -> Stability:
-        """The stability judgement that follows from the behaviour at the end of a run.
+        """The judgement that the motion at the end alone suggests.
 
-        Other knowledge about the run may change it.
+        Arms at rest or with decaying motion give SETTLED, motion without a clear trend gives
+        OPEN, and oscillating, drifting or growing motion gives NOT_STABLE. Other knowledge,
+        such as proofs, may change it in `stability_decision`.
         """
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.SETTLED
@@ -213,7 +220,11 @@ class RunEnd(NamedTuple):
 
     @property
     def phrase(self) -> str:
-        """A phrase for the behaviour at the end, which names errors that stay."""
+        """A phrase for the behaviour at the end, such as "converged" or "growing".
+
+        If the arms rest, but with synchronisation errors above the limit of settled sites, the
+        phrase says that errors stay.
+        """
         has_converged = self.behaviour is EndBehaviour.CONVERGED
         if has_converged and self.end_error_rad > SETTLED_ERROR_RAD:
             return LASTING_ERRORS

@@ -55,7 +55,11 @@ def follows_in_task_space(log: Log) -> bool:
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns the torque of operator and environment on the arm, shape (K, n), in N m."""
+    """Returns the torque of operator and environment ON the arm, shape (K, n), in N m.
+
+    The records contain tau_x, which Eq. (8) subtracts and which therefore has the opposite
+    sign.
+    """
     return 0.0 - part.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
 
 
@@ -128,7 +132,14 @@ def find_last_error(log: Log) -> JointError | None:
 
 
 def largest_magnitude(values: Array) -> Array:
-    """Returns the largest absolute value of each row, shape (K,)."""
+    """Returns the largest absolute value of each row, for example over the joints of an arm.
+
+    Args:
+        values: Values, shape (K, n).
+
+    Returns:
+        The largest values, shape (K,). Zeros if a row has no entries.
+    """
     magnitudes = np.abs(values)
     largest: Array = magnitudes.max(axis=1, initial=0.0)
     return largest

@@ -288,7 +288,10 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """The operator's whole torque, shape (K, n), in N m."""
+        """The operator's whole torque, shape (K, n), in N m.
+
+        It is the sum of the continuous torque and the torque that is held over a tick.
+        """
         return self.operator_now + self.operator_held
 
     @property

@@ -136,9 +136,10 @@ class SiteEnergy:
 
     @property
     def largest_age_s(self) -> float:
-        """The largest age of a state that the site received and used, in s.
+        """Largest age of the peers' states that the site used in a tick, in s.
 
-        It is 0 if the site never used a state of a peer.
+        The age of a state is the time since the peer sent it, thus the delay that the
+        controller sees. It is 0 if the site never used a state of a peer.
         """
         t_s = self.motion.records.t_s
         largest_s = []
@@ -416,14 +417,19 @@ class EnergyBalance:
 
     @property
     def external_work(self) -> Array:
-        """Work of operators, environments and stops since the first tick, shape (T,), in J."""
+        """Work of operators, environments and stops on all arms since the first tick, in J.
+
+        The stability proof permits V to rise by this amount. The shape is (T,), with one entry
+        per tick.
+        """
         return _sum(self._work_from_outside)
 
     @property
     def external(self) -> dict[str, Array]:
-        """Work of those operators, environments and stops that did any work, by source, in J.
+        """Work of each external source that did any work, by its name, shape (T,), in J.
 
-        Each entry has the shape (T,).
+        The sources are the operators, the environments and the mechanical stops of joints. The
+        text of the certificate names them.
         """
         sources = self._work_from_outside
         return {name: work for name, work in sources.items() if work.any()}

@@ -141,7 +141,11 @@ class SiteConstants(NamedTuple):
 
     @property
     def unknown_friction(self) -> Array:
-        """Fraction of each joint's friction that the law does not compensate, shape (n,)."""
+        """Fraction of each joint's friction that the law does not compensate, shape (n,).
+
+        It is 0 for a joint without friction. Uncompensated friction does work that the energy
+        balance must contain, and an adaptive law cannot learn it.
+        """
         joints = len(self.Kp)
         unit_speeds = np.ones((1, joints))
         friction_torque = self.arm.friction(unit_speeds)[0]
@@ -151,9 +155,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def adapts(self) -> Bools:
-        """Marks the dynamic parameters that the control law estimates, shape (P,).
+        """Marks the parameters of the arm that the law estimates while it runs, shape (P,).
 
-        The other parameters keep the value that the scenario gives them.
+        These are the parameters with a positive adaptation gain Gamma. The others keep the
+        value that the scenario gives them.
         """
         return self.Gamma > 0.0
 
@@ -601,7 +606,11 @@ class Increment(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """The energy of each tick period, including its jump, shape (K - 1,), in J."""
+        """Change of the energy in each tick period, in J, as the sum of the three parts.
+
+        The parts are the contribution of the power at its start, that at its end, and the jump
+        there. K ticks bound K - 1 periods, so that the shape is (K - 1,).
+        """
         return self.left + self.right + self.jump
 
 

@@ -53,9 +53,12 @@ NEGATIVE_ENERGY_MEANING = (
 
 
 class ObservedFinding(StrEnum):
-    """Result of the check that the energies which control laws declare stay above zero.
+    """Result of checking the energies that control laws declare, such as a tank's.
 
-    The value of each member is a phrase for the user.
+    A law that never returns more energy than it received keeps its declared energy above zero.
+    The result is BROKEN if the declared energy does not follow from the recorded torques and
+    velocities, and NOT_JUDGED if the records do not suffice. The value of each member is the
+    phrase for the user.
     """
 
     PASSIVE = "observed energy never below zero"
@@ -144,9 +147,10 @@ class ObservedEnergy(NamedTuple):
     curves: Sequence[_EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
-        """Returns this verdict on the declared energies as plain values, ready for JSON.
+        """Returns the verdict, its premises and the least energies as values for JSON.
 
-        The energies over time are left out.
+        The energies over time are left out, because they have a value per tick and serve for
+        figures.
         """
         content = self._asdict()
         del content["curves"]

@@ -18,7 +18,11 @@ from ..torque_sources import WallEnergy
 
 
 class FunctionalObstacle(Enum):
-    """Reason why the energy function V of the stability proof does not exist for an arm."""
+    """Reason why the energy function V of the stability proof does not exist for an arm.
+
+    Without V, the certificate judges the run by the other methods, for example by its final
+    motion.
+    """
 
     UNKNOWN_PARAMETERS = auto()
     """The parameters theta of the arm are unknown."""
@@ -43,17 +47,21 @@ class MissingFunctional(NamedTuple):
 
 
 class LawQuantities(NamedTuple):
-    """Quantities of the premise that every site has an adaptive law, and V exists.
+    """Evidence for the premise that V exists, as each site has an adaptive law.
 
     Attributes:
-        missing: Sites without V, grouped by the reason.
+        missing: Sites without V, grouped by the reason. The premise holds if there are none.
     """
 
     missing: tuple[MissingFunctional, ...]
 
 
 class ParameterFault(Enum):
-    """Reason why an adaptive law cannot learn the parameters theta of its arm."""
+    """Reason why an adaptive law cannot learn the true parameters theta of its arm.
+
+    The proof assumes that constant parameters exist with which the law is exact. Each fault
+    makes this assumption false, and the premise names the sites concerned.
+    """
 
     OUTSIDE_BOX = auto()
     """Theta is outside the box in which the law keeps its estimates."""
@@ -98,7 +106,11 @@ class WallQuantities(NamedTuple):
 
     @property
     def active(self) -> tuple[WallEnergy, ...]:
-        """Walls whose arm dissipates less energy than they generate."""
+        """Walls that generate at least as much energy as the touching arm's damping removes.
+
+        A simulated wall computes its force once per tick and thereby generates energy. If the
+        arm does not remove it, the contact may vibrate. Empty if there is no such wall.
+        """
         return tuple(
             wall for wall in self.walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m
         )
@@ -152,7 +164,7 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """The time during which a site did not follow its peers.
+    """Interval in which a site did not follow its peers, contrary to a premise.
 
     Attributes:
         site: Name of the site.
@@ -195,10 +207,13 @@ class CutTorque(NamedTuple):
 
 
 class TorqueQuantities(NamedTuple):
-    """Quantities of the premise that no torque was cut off.
+    """Evidence for the premise that every arm received the whole torque of its control law.
+
+    An actuator cuts off a torque above its limit. The arm then receives another torque than the
+    proof assumes.
 
     Attributes:
-        cut: Sites whose torque was cut off.
+        cut: Sites whose torque was cut off. The premise holds if there are none.
     """
 
     cut: tuple[CutTorque, ...]
@@ -219,10 +234,10 @@ class TouchedStop(NamedTuple):
 
 
 class StopQuantities(NamedTuple):
-    """Quantities of the premise that no joint touches its stops.
+    """Evidence for the premise that no joint touched the mechanical stops that limit its range.
 
     Attributes:
-        touched: Sites whose arms touched their stops.
+        touched: Sites whose arms touched their stops. The premise holds if there are none.
     """
 
     touched: tuple[TouchedStop, ...]

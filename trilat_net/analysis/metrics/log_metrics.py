@@ -125,7 +125,10 @@ class LogMetrics(Result):
         return joint_unit
 
     def headline(self) -> str:
-        """Returns a line for the user: the log, its sites, and the number of known values."""
+        """Returns one line with the log, the number of known values, and the sites.
+
+        For example "run.mcap: 84 numbers of paper, m1, m2, s".
+        """
         known = 0
         for _, metric in self._list_values():
             known += metric.value is not None
@@ -134,7 +137,11 @@ class LogMetrics(Result):
         return f"{self.log}: {numbers} of {self.scenario}, {sites}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the metrics as plain values, with the keys of `trilat metrics --json`."""
+        """Returns the metrics as plain values, with the keys of `trilat metrics --json`.
+
+        Each subject has its own dictionary: `["sites"]["m1"]` has the metrics of site m1 by
+        key. A value that is not known is None, and the entry "unknown" has the reason.
+        """
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
             "log": self.log,
@@ -184,9 +191,10 @@ class LogMetrics(Result):
         return reasons
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the metrics as a table of plain values.
+        """Returns a table with a row for each quantity and each subject that has the quantity.
 
-        There is a row for each quantity and each subject (run, site, link or wall) that has it.
+        A subject is the run, a site, a link or a wall. A row has the keys "group", "key",
+        "name", "of" (the subject), "unit", "value", and "why", the reason if the value is None.
         """
         rows: list[dict[str, Any]] = []
         for description, metric in self._list_values():
@@ -347,7 +355,7 @@ def _measure_subjects(view: RunView, wanted: Iterable[Measure]) -> dict[str, _Su
 
 
 def find_quantity(key: str) -> Quantity:
-    """Returns the quantity with a given key.
+    """Returns the definition of the quantity with a key such as "rms_error_rad".
 
     Raises:
         KeyError: No quantity has this key. The message names the most similar key.

@@ -285,11 +285,18 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
 
 
 def list_measures() -> list[Measure]:
-    """Returns all functions that measure quantities, in the order in which they are shown."""
+    """Returns all registered functions that measure quantities, ordered by group.
+
+    The groups have the order in which they are shown to the user. Groups that are not in this
+    order, such as those of a new file, are last.
+    """
     rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
     return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
 
 
 def quantities() -> list[Quantity]:
-    """Returns the definitions of all quantities, in the order in which they are shown."""
+    """Returns the definitions of all quantities that any function of this folder measures.
+
+    Tables and docs/reference/metrics.md list them in this order.
+    """
     return [quantity for measure in list_measures() for quantity in measure.quantities]

@@ -310,9 +310,10 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Relative difference between the felt torque and the expected torque, from 0.
+        """Deviation of the felt torque from the expected torque, relative to the latter.
 
-        None if the expected torque is unknown or zero.
+        For example, 0.1 means that the felt torque is 10 % larger or smaller. None if the
+        expected torque is unknown or zero.
         """
         expected = self.expected_nm.value
         if expected is None or expected == 0.0:

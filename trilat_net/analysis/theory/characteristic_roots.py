@@ -90,7 +90,12 @@ _BLAS_SYMBOLS = (
 
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
-    """Limits NumPy's linear algebra to one thread while the context is active."""
+    """Limits NumPy's linear algebra (BLAS) to one thread while the context is active.
+
+    For the small matrices of a loop, several threads cost more time than they save. The number
+    of threads is restored at the end, also after an exception. If the BLAS library has no
+    functions for this, the context has no effect.
+    """
     functions = _find_blas_functions()
     if functions is None:
         yield
@@ -217,7 +222,8 @@ class Pencil(NamedTuple):
     def delayed_states(self) -> NDArray[np.intp]:
         """Indices of the states whose delayed values act on the loop.
 
-        An arm, for example, follows the angles that another arm had some time ago.
+        An arm, for example, follows the angles that another arm had some time ago. Few states
+        do so, and only these are discretised over the delay, which keeps the matrices small.
         """
         effects = np.abs(self.Ad).sum(axis=(0, 1))
         return np.flatnonzero(effects)
@@ -289,7 +295,11 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio of the mode, -re(s) / abs(s). It is negative if the mode grows."""
+        """Damping ratio of the mode, -re(s) / abs(s), from -1 to 1.
+
+        It is 1 for a decay without oscillation, 0 for a lasting oscillation, and negative if
+        the mode grows.
+        """
         return -self.s.real / abs(self.s)
 
     @property
@@ -369,7 +379,12 @@ class Spectrum(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The stability of the loop: "stable", "unstable" or "at the edge"."""
+        """The stability by the rightmost root: "stable", "unstable" or "at the edge".
+
+        A root closer to the imaginary axis than `STABILITY_EDGE_PER_S`, or than twice its
+        standard deviation for random delays, is at the edge. So is a loop with a zero root
+        whose motion drifts.
+        """
         rightmost_per_s = -math.inf
         if self.roots:
             rightmost_per_s = self.roots[0].s.real
@@ -728,7 +743,16 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
 
 
 def chebyshev_nodes(order: int) -> Array:
-    """Returns the extremal nodes cos(pi k / order) from 1 to -1, shape (order + 1,)."""
+    """Returns the points of [-1, 1] at which the discretisation evaluates delayed states.
+
+    These are the extremal nodes cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
+
+    Args:
+        order: Degree of the polynomial through the points.
+
+    Returns:
+        The nodes, shape (order + 1,).
+    """
     angles = np.pi * np.arange(order + 1) / order
     return np.cos(angles)
 

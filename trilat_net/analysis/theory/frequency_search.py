@@ -71,7 +71,7 @@ class Minima(NamedTuple):
 
     @property
     def least_hz(self) -> float:
-        """The frequency at which the curve has its least value, in Hz."""
+        """Frequency of the deepest minimum of the curve, in Hz, for texts."""
         least_index = self.values.argmin()
         w_rad_s = self.w_rad_s[least_index]
         return float(w_rad_s / (2.0 * np.pi))

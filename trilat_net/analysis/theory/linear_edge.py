@@ -259,7 +259,10 @@ class _GrowthPoint(NamedTuple):
 
     @property
     def is_unstable(self) -> bool:
-        """True if the rightmost root is to the right of the imaginary axis."""
+        """True if small motions grow at this value of the setting.
+
+        An edge lies between two neighbouring values of which only one is unstable.
+        """
         return self.growth_per_s > 0.0
 
 

@@ -166,7 +166,19 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
             raise ScenarioError(problem, source=log.source)
 
     def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns the samples of site j that site i used, from its records."""
+        """Returns which samples of a peer a site had in use at given ticks, from its records.
+
+        A sample is the state that a site sends once per tick, and samples are numbered from 0.
+        A tick without a record has the samples of the last record before.
+
+        Args:
+            i: Index of the receiving site.
+            j: Index of the peer that sent the samples.
+            ticks: Ticks of the receiving site, shape (K,).
+
+        Returns:
+            Numbers of the samples, shape (K,). Negative before the first sample.
+        """
         site_log = site_logs[i]
         rows_after = np.searchsorted(site_log.tick, ticks, side="right")
         rows = np.maximum(rows_after - 1, 0)
@@ -208,7 +220,20 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         return find_log_loop(simulate_scenario(ended), own_laws=True)
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns the samples of site j that site i used, as its link draws them."""
+        """Returns which samples of a peer a site had in use at ticks, by the delay model.
+
+        The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
+        without a log has no records, but the random delays of the link can be drawn again from
+        its seed.
+
+        Args:
+            i: Index of the receiving site.
+            j: Index of the peer that sent the samples.
+            ticks: Ticks of the receiving site, shape (K,).
+
+        Returns:
+            Numbers of the samples, shape (K,). -1 before the first sample.
+        """
         site = ended.names[i]
         peer = ended.names[j]
         name = f"{peer}->{site}"
@@ -567,7 +592,7 @@ class _SiteMotion(NamedTuple):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
+        """True if no joint exceeded `SETTLED_SPEED_RAD_S` in the last second of the run."""
         in_last_second = self.t_s > self.t_s[-1] - 1.0
         last_speeds = np.abs(self.qd[in_last_second])
         return float(last_speeds.max()) <= SETTLED_SPEED_RAD_S

@@ -88,9 +88,10 @@ class _EffectiveDelay(NamedTuple):
 
     @property
     def varies(self) -> bool:
-        """True if the age is not constant.
+        """True if the age of the used samples is not constant.
 
-        Times of ticks are whole nanoseconds, so that constant ages differ a little.
+        Differences up to 10 ns do not count, because the times of ticks are whole nanoseconds,
+        so that constant ages differ a little.
         """
         return self.most_s > self.least_s + 1e-8
 

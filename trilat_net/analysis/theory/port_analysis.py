@@ -232,7 +232,7 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The word for a port: "joint", or "axis" in task space."""
+        """The word for a port in texts: "joint", or "axis" for arms in task space."""
         return "axis" if self.axes else "joint"
 
     @property

@@ -213,7 +213,11 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
 
 
 def to_imaginary_axis(w_rad_s: Array) -> Complex:
-    """Returns j w for frequencies w, in rad/s."""
+    """Returns the points s = j w at which a frequency response is evaluated, in 1/s.
+
+    Args:
+        w_rad_s: Frequencies w, in rad/s.
+    """
     return np.asarray(1j * w_rad_s, dtype=np.complex128)
 
 
@@ -305,7 +309,10 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
 
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of a loop, in s. 0 if it has no delay."""
+    """Returns the longest delay of any link or signal in a linear loop, in s.
+
+    Returns 0 for a loop without delays.
+    """
     delays_s = [term.delay_s for term in loop.delayed]
     return max(delays_s, default=0.0)
 

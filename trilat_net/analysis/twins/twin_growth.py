@@ -191,7 +191,8 @@ class TwinGrowth(NamedTuple):
     def worst(self) -> PushGrowth | None:
         """The push whose effect grew most, or died away most slowly.
 
-        A push is a small disturbance in a repetition of the run. None if there are no pushes.
+        A push is a small disturbance in a repetition of the run. The trend of this push counts
+        as the trend of the whole run. None if there are no pushes.
         """
         return max(self.pushes, key=_rank_badness, default=None)
 
@@ -268,7 +269,12 @@ class TwinGrowth(NamedTuple):
 
     @property
     def period_text(self) -> str:
-        """A sentence for a judged part that is shorter than the period of the delays."""
+        """A sentence for repetitions that were shorter than the period of the delays.
+
+        Pushes that died away then prove little, because the delays of the rest of the period
+        were never tried. For example "the delays repeat after 20 s, but the twins were judged
+        over 8 s".
+        """
         judged_s = self.to_s - self.from_s
         return (
             f"the delays repeat after {self.delay_period_s:.6g} s, but the twins were judged "
@@ -301,9 +307,10 @@ class TwinGrowth(NamedTuple):
         return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Returns how each small push of the run grows or dies away, as plain values.
+        """Returns the trend of each push, and of all together, as plain values for JSON.
 
-        They are ready for JSON.
+        The trend of a push states how its effect developed, with its rate in 1/s and the factor
+        by which it grew or fell. Numbers that are not finite become None.
         """
         pushes = [
             {
@@ -845,9 +852,9 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the pushes and how they develop as plain values, ready for JSON.
+        """Returns the pushes and how they develop, with the keys of `trilat twin --json`.
 
-        The keys are those of `trilat twin --json`.
+        The entry "linear" is None if the growth was not compared with characteristic roots.
         """
         growth = self.growth.to_json()
         return {
