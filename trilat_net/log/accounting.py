@@ -222,9 +222,11 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """States that the sender has published at least `published` messages, numbered from 0.
+        """States that the sender has published at least the messages 0 to `published` - 1.
 
-        Those that have not been received count as missing from now on.
+        Those that have not arrived count as missing from now on. Without such a statement,
+        messages missing at the end would remain unnoticed, because no later number reveals the
+        gap.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
@@ -296,25 +298,33 @@ class Account:
 
     @property
     def expected(self) -> int:
-        """Number of messages that are known to have been published."""
+        """Number of messages that are known to have been published.
+
+        Numbers that never had a message (`unpublished`) are not counted.
+        """
         return self.last + 1 - self.unpublished
 
     @property
     def missing(self) -> int:
-        """Number of messages that were published but not received."""
+        """Number of messages that were published, but not received, not even on request."""
         return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
         """Ranges of missing numbers in ascending order, as pairs [first, last].
 
-        There are at most `MAX_GAPS` pairs: those with the highest numbers.
+        For example [[10, 12]] if the messages 10, 11 and 12 are missing. There are at most
+        `MAX_GAPS` pairs: those with the highest numbers.
         """
         return [list(gap) for gap in self._gaps]
 
     @property
     def largest_gap(self) -> int:
-        """Number of missing messages in the largest gap. It is 0 if no message is missing."""
+        """Number of missing messages in the largest gap, 0 if no message is missing.
+
+        A long gap means an interruption, while the same number of single losses may be
+        harmless.
+        """
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def describe(self, *before: "Account") -> str:
@@ -513,7 +523,8 @@ class Coverage(NamedTuple):
     def share(self) -> float:
         """Smallest fraction of recorded or checked ticks of any site, from 0 to 1.
 
-        It is 0 if no site has ticks.
+        A run is known only as well as its worst site. The fraction is 0 if no site has ticks,
+        and a single site without ticks does not lower it.
         """
         if not any(self.expected.values()):
             return 0.0

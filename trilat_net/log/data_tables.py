@@ -111,9 +111,9 @@ class Column(NamedTuple):
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a column of numbers as an array, shape (K,).
+        """Returns the values of a column of numbers, shape (K,), with NaN for missing values.
 
-        A row without a value contains NaN.
+        Exports to formats without missing values use it, such as NumPy files.
         """
         if self.known is None or self.known.all():
             return self.values
@@ -171,7 +171,7 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table in the form of a file name, such as "m1_link" or "events"."""
+        """Name of the table for file names, such as "m1_link", or "events" for all sites."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
 

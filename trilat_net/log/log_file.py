@@ -81,7 +81,7 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Frees the reserved disk space, so that other files can use it.
+        """Frees the reserved disk space, so that the end of the log fits on a full disk.
 
         Later calls of `grow` reserve nothing.
         """
@@ -167,7 +167,7 @@ class _FileSync:
     def wait(self) -> None:
         """Waits until the thread that syncs the file has ended.
 
-        The file must not be closed before.
+        The file must not be closed before, as the thread uses its descriptor.
         """
         if self._thread is not None:
             self._thread.join()
@@ -354,7 +354,11 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True if the file is complete: it ends with the end mark of the MCAP format."""
+        """True if the file is complete: it ends with the end mark of the MCAP format.
+
+        Only such a file gets its final name. Another one keeps the suffix ".active", and can be
+        recovered.
+        """
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
@@ -387,7 +391,10 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes the file and removes it, because the log is not wanted."""
+        """Closes the file and removes it, because the log is not wanted.
+
+        An error while closing is ignored, since no data need to be saved.
+        """
         with suppress(OSError):
             self.close()
         self.working.unlink(missing_ok=True)

@@ -149,8 +149,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def headline(self) -> str:
         """Summarises the session in one line for the user.
 
-        Returns:
-            A text with how the session ran, its sites, its length and its number of records.
+        The line says how the session ran, its sites, its length and its number of records. It
+        ends with "not finished" if the end of the log is missing.
         """
         try:
             summary = self._describe_records()
@@ -176,9 +176,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return text
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns a summary of the session as plain values, for JSON.
+        """Returns a summary of the session, with the keys of `trilat sim --json`.
 
-        The keys are those of the output of `trilat sim --json`.
+        The entry "sites" has the numbers of each site by its name. The records themselves are
+        not included.
         """
         return {
             "files": list(self.sources),
@@ -341,7 +342,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def diverged_s(self) -> float | None:
         """Time at which the first arm exceeded a safety limit, which ended the run, in s.
 
-        It is None if all arms stayed within their limits.
+        None if all arms stayed within their limits.
         """
         times_s = [part.diverged_s for part in self.values()]
         known_times_s = [time_s for time_s in times_s if time_s is not None]
@@ -374,7 +375,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def failed_hands(self) -> list[str]:
-        """Sentences that say which programs failed while they moved an arm, when, and why."""
+        """Sentences on the programs that failed while they moved an arm: which, when, and why.
+
+        Empty if none failed.
+        """
         return [
             event.text
             for event in self.events
@@ -830,7 +834,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages(ordered_events, log_ns[order], publish_ns[order])
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Decodes the statistics that the recorder published about itself.
+        """Decodes the statistics that the recorder published about itself while it recorded.
+
+        They show, for example, how many messages of each channel were missing.
 
         Returns:
             The messages in the order of the file. Empty if the log contains none.

@@ -60,7 +60,11 @@ class _LogViews(Protocol):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes."""
+        """Upper bound for the size of the messages that are not written yet, in bytes.
+
+        A writer adds this size when it decides whether the next message still fits into the
+        file.
+        """
 
     def open_channels(self, file: McapWriter) -> _ViewChannels:
         """Returns the channels for viewers of a file, which are registered when needed.
@@ -203,12 +207,15 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True if no message can be added: the log is finished, or the disk refused data."""
+        """True if no message can be added: the log is finished, or the disk refused data.
+
+        Messages that arrive later are then missing in this file.
+        """
         return bool(self._end_reason)
 
     @property
     def messages(self) -> int:
-        """Number of messages that were added to the file."""
+        """Number of messages that were added to the file, even if not yet on the disk."""
         return self._file.messages
 
     @property
@@ -538,7 +545,10 @@ class LogParts:
 
     @property
     def path(self) -> Path:
-        """Final name of the file that is being written."""
+        """Final name of the file that is being written, such as run-002.mcap for part 2.
+
+        While it is written, the file has another name, which ends with ".active".
+        """
         return self._file.path
 
     @property
@@ -582,6 +592,8 @@ class LogParts:
 
     def flush(self) -> None:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
+
+        A loss of power still can, because the operating system writes to the disk later.
 
         Raises:
             LogRefused: The disk refused the data.

@@ -76,7 +76,8 @@ _COMPRESSION_NAME = re.compile(
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
     """Error that a part of a file makes no sense. Its text states the reason.
 
-    It is used only within the package `log`.
+    It is used only within the package `log`: a scan catches it and continues at the next
+    readable part, and a check reports it.
     """
 
 
@@ -248,7 +249,7 @@ class RecordFrame(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Offset of the first byte after the record."""
+        """Offset of the first byte after the record, at which the next record begins."""
         return self.offset + self.size
 
 
@@ -291,13 +292,18 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record, without the fields for its kind and its length."""
+        """Content of the record, without the fields for its kind and its length.
+
+        It is read from the file at first use, so that a scan of a large file is fast.
+        """
         if self._content is None:
             self._content = self._scanner.content(self.frame)
         return self._content
 
     def head(self) -> "ChunkHead":
-        """Returns the head of a chunk, see `RecordScanner.head`.
+        """Returns the head of a chunk, without unpacking its messages.
+
+        The head states the times of the messages, and how they are compressed.
 
         Raises:
             UnreadableRecord: The head is incomplete, or contains impossible values.
@@ -367,7 +373,10 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every record that `scan` finds."""
+        """Yields the kind and the position of every record that `scan` finds.
+
+        Unreadable parts of the file are left out.
+        """
         for item in self.scan():
             if isinstance(item, ScannedRecord):
                 yield item.frame

@@ -69,7 +69,7 @@ class Sink(Protocol):
         """
 
     def flush(self) -> None:
-        """Writes all bytes that are stored in the buffer."""
+        """Passes all bytes that are stored in the buffer on to the file."""
 
 
 def _pack_text(text: str) -> bytes:
@@ -318,7 +318,11 @@ class McapWriter:
         self._add_to_summary(Opcode.ATTACHMENT_INDEX, index)
 
     def flush(self) -> None:
-        """Closes the open chunk, if it contains messages, and flushes the stream."""
+        """Ends the open chunk, if it contains messages, and flushes the stream.
+
+        All messages so far can then be read from the file, even if the program ends now.
+        Frequent calls make small chunks, which are compressed less well.
+        """
         if self._open_chunk:
             self._close_chunk()
         if self._reserve is not None:

@@ -63,9 +63,10 @@ class Integrity(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """False only if something in the file was changed or removed.
+        """False only if something in the file was changed or removed after it was recorded.
 
-        A file without digests, or a file that was not finished, cannot be compared. It passes.
+        A file without digests, or a file that was not finished, cannot be compared. It passes,
+        because nothing speaks against it.
         """
         return self.state is not DigestState.CHANGED
 

@@ -389,10 +389,11 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Describes the missing records for the user.
+        """Describes the missing records for the user, one line for each site that lacks some.
 
         Yields:
-            A line for every site that lacks records, with the first ranges of missing ticks.
+            A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks.
+                Sites without missing records have no line.
         """
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)

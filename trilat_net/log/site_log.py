@@ -158,7 +158,11 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=blocks)
         def get_block(number: int) -> list[State]:
-            """Decodes and returns consecutive records: the block `number`, counted from 0."""
+            """Returns a block of consecutive records, decoded unless it is in memory.
+
+            Args:
+                number: Number of the block, counted from 0.
+            """
             first = number * size
             return decode_block(payloads[first : first + size])
 
@@ -477,27 +481,32 @@ class SiteLog:
     def states(self) -> Sequence[State]:
         """The whole records in the order of their ticks, decoded and checked.
 
-        If there are many, a record is decoded only when it is accessed.
+        If there are many, a record is decoded only when it is accessed. To compute with a
+        single quantity, the arrays such as `q` are much faster.
         """
         return decode_records(self.payloads, self._decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """The records by tick. If several records have the same tick, the last one counts."""
+        """The records by tick, to compare two logs whose records may have gaps.
+
+        If several records have the same tick, the last one counts.
+        """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
     @property
     def last_tick(self) -> int:
-        """Tick of the last record. It is -1 if there are no records."""
+        """Tick of the last record, counted from the start of the run. -1 without records."""
         return int(self.tick[-1]) if len(self) else -1
 
     @property
     def diverged_s(self) -> float | None:
         """Time at which the arm exceeded a safety limit, which ended the run, in s.
 
-        It is None if the arm stayed within its limits.
+        It is the time of the last record if its mode is "diverged". None if the arm stayed
+        within its limits, or if there are no records.
         """
         if not len(self):
             return None
@@ -506,7 +515,11 @@ class SiteLog:
 
     @property
     def missing(self) -> int:
-        """Number of ticks before the last record that have no record."""
+        """Number of ticks before the last record that have no record.
+
+        The network or a full queue lost these records, or the site skipped the ticks. Records
+        that are missing at the end cannot be counted here.
+        """
         if not len(self):
             return 0
         # There are `last_tick` ticks before the last record. The ticks of the log, without
@@ -516,7 +529,10 @@ class SiteLog:
 
     @property
     def skipped(self) -> int:
-        """Number of ticks that the site skipped because it was late, as its records state."""
+        """Number of ticks that the site skipped because it was late, as its records state.
+
+        Only a site with an external arm skips ticks: a real arm cannot catch up.
+        """
         return sum(count_skipped_ticks(texts) for texts in self._changes.values())
 
     mode = _RecordField(
@@ -581,7 +597,10 @@ class SiteLog:
 
     @cached_property
     def t_s(self) -> Array:
-        """Nominal time since the epoch, the common start of the session, shape (K,), in s."""
+        """Nominal time since the epoch, the common start of the session, shape (K,), in s.
+
+        It is the ideal time of each tick, not the time at which the tick was computed.
+        """
         return freeze(self.t_ns / NS_PER_S)
 
     @cached_property

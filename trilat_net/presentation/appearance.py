@@ -60,7 +60,11 @@ class FigureSize(NamedTuple):
 
     @property
     def narrow(self) -> bool:
-        """True if the figure is too narrow for two panels with long texts beside each other."""
+        """True if the figure is narrower than 5 in: too narrow for two panels side by side.
+
+        Figures then put their panels, parts with axes of their own, below each other, or show
+        fewer labels.
+        """
         return self.width_in < 5.0
 
 

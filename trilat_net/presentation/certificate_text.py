@@ -135,7 +135,11 @@ class CertificateLine(NamedTuple):
 
     @property
     def print_form(self) -> MarkedText:
-        """The sentence behind its mark, without a first word that repeats the mark."""
+        """The sentence behind its coloured mark, as the terminal and the page show it.
+
+        The mark says "ok", for example. If the sentence begins with the same word and a colon,
+        it is left out, so that it does not appear twice.
+        """
         return MarkedText(MARKS[self.mark], self.text.removeprefix(f"{self.mark}: "))
 
 

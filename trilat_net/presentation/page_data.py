@@ -283,7 +283,7 @@ class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the sites, as CSS writes them.
+    """Colours of the sites, in the order of the scenario, as CSS writes them: "#004488".
 
     Attributes:
         light: Colours for light screens.
@@ -321,6 +321,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Converts the data to dictionaries, lists and plain values, ready for JSON."""
+        """Converts the data to plain values, which the page contains as JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

@@ -54,7 +54,10 @@ class _Lead(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """True if no factor changes during the run."""
+        """True if no dominance factor of the slave changes during the run.
+
+        A sentence then says all, and a bar over time would show nothing.
+        """
         return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
 
 
@@ -71,7 +74,7 @@ def _name_role(scenario: Scenario, site: str) -> str:
 
 
 def caption_site(scenario: Scenario, site: str) -> str:
-    """Returns the name and the role of a site, as in "m1, master 1"."""
+    """Returns the caption of a site's arm in the drawing, for example "m1, master 1"."""
     return f"{site}, {_name_role(scenario, site)}"
 
 

@@ -280,7 +280,15 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     drawn_s = start_s
 
     def show(done: int, total: int) -> None:
-        """Draws the progress, unless the last drawing was very recent."""
+        """Draws the progress of a command, for example 12 of 50 runs.
+
+        The bar appears only if the command takes longer than `PATIENCE_S`. Drawings that follow
+        each other too quickly are left out, because they would slow down the work.
+
+        Args:
+            done: Number of finished items.
+            total: Number of all items.
+        """
         nonlocal drawn_s
         now_s = display.get_time()
         if now_s - start_s < PATIENCE_S:

@@ -136,7 +136,7 @@ class Arm(fields.Frozen, frozen=True):
     links: dict[str, LinkInertia] = msgspec.field(default_factory=dict)
 
     def planar_links(self) -> ArmLinks:
-        """Returns the lengths, masses and inertias of the planar arm of two links.
+        """Returns the lengths, masses and inertias of the two links of a planar arm.
 
         They are meaningless if the arm is a chain from a URDF file.
         """
@@ -187,9 +187,9 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of coordinates that the sites share in task space.
+        """Number of coordinates that sites share in task space: 3 for positions, 6 for poses.
 
-        It is 0 if the sites share joint angles.
+        It is 0 if the sites share joint angles, whose number depends on the arm.
         """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
@@ -275,9 +275,10 @@ class ArmModel(NamedTuple):
 
     @property
     def parameters(self) -> list[tuple[str, str]]:
-        """Name and unit of each inertial parameter, in the order of `theta`.
+        """Label and unit of each inertial parameter, in the order of `theta`.
 
-        Figures and messages use them as labels.
+        The planar arm has "theta_1", "theta_2" and so on. A chain names the link and the
+        quantity. Figures and messages use these labels.
         """
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
@@ -404,7 +405,7 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the sites share the position or pose of their end effectors.
+        """True if the sites share the position or pose of their end effectors (task space).
 
         Otherwise they share their joint angles.
         """
@@ -414,6 +415,7 @@ class ArmModel(NamedTuple):
     def axes(self) -> tuple[float, ...]:
         """For each task coordinate, 1 if the site follows its peers along it, and 0 if not.
 
+        For example (1, 1, 0) for an end effector that follows in x and y, and is free in z.
         Empty if the sites share joint angles.
         """
         task = None if self.chain is None else self.chain.task

@@ -329,7 +329,10 @@ class MeasuredTrace(Result):
 
     @property
     def delay_ms(self) -> Array:
-        """Delays of all messages that were not lost, in ms, in the order of sending."""
+        """Delays of all messages that were not lost, in ms, in the order of sending.
+
+        Statistics of the measured network are computed from them.
+        """
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:

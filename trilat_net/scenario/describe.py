@@ -147,7 +147,11 @@ _TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
 
 
 def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each site, its control law, and the facts on which its stability depends."""
+    """Yields each site, its control law, and the facts on which its stability depends.
+
+    The facts, such as delays, dominance factors and tick rates, are the input of the stability
+    condition that a law may have.
+    """
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
     hold_s = _find_hold_time(scenario)

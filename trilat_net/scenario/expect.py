@@ -302,9 +302,10 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if the scenario states at least one expectation that a run must satisfy.
+        """True if the scenario states at least one condition that its runs must satisfy.
 
-        A tolerance alone is not an expectation.
+        A tolerance alone only says how precisely other conditions are judged, and does not
+        count.
         """
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()

@@ -77,15 +77,15 @@ class _NamedCode(Protocol):
 
     @property
     def code(self) -> str:
-        """Module and name of the class, for example "package.module:Law"."""
+        """Module and name of the user's class, for example "package.module:Law"."""
 
     @property
     def source_sha256(self) -> str:
-        """SHA-256 hash of the file of the module. It shows whether the file has changed."""
+        """SHA-256 hash of the file of the module, which shows whether the file has changed."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments with which an object of the user's class is created, by name."""
+        """Arguments by name with which an object of the user's class is created."""
 
 
 ANY_SETTINGS = "*"

@@ -76,8 +76,9 @@ def read_shipped(name: str) -> str:
 def read_template() -> str:
     """Returns the text that `trilat scenario new` writes: a valid scenario with comments.
 
-    >>> tn.load_scenario(tn.read_template()).names
-    ('m1', 'm2', 's')
+    A user edits the text to describe an experiment.
+
+    >>> tn.load_scenario(tn.read_template()).names ('m1', 'm2', 's')
     """
     return (SHIPPED_FOLDER / "_template.toml").read_text(encoding="utf-8")
 

@@ -260,13 +260,17 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
     def start_ns(self) -> int:
         """Time at which the change takes effect, in ns after the epoch.
 
-        The epoch is the common start time of the sites.
+        The epoch is the common start time of the sites. Times of the simulation are integers,
+        so that they are the same on every machine.
         """
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """All settings of the link after this change. Only a change of a link has them."""
+        """All settings of the link after this change, not only those that change.
+
+        Only a change of a link has them.
+        """
         return msgspec.convert(self.to, Link)
 
 
@@ -387,7 +391,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, in the order of the scenario file."""
+        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file.
+
+        Arrays with an entry per site, such as `alpha`, have this order.
+        """
         return tuple(self.sites)
 
     @cached_property
@@ -414,9 +421,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """Matrix of dominance factors, shape (N, N), Eq. (6).
+        """Matrix of the dominance factors at the start of the run, shape (N, N), Eq. (6).
 
-        The entry of row i and column j is the weight with which site i follows site j.
+        The entry of row i and column j is the weight with which site i follows site j. A site
+        without a factor for a peer does not follow it.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
@@ -478,7 +486,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def sha256(self) -> str:
         """SHA-256 hash of the scenario's TOML text in its canonical form (`text`).
 
-        Two scenarios have the same hash only if they describe the same experiment.
+        Two scenarios have the same hash only if they describe the same experiment. Sites
+        compare hashes before they join a session.
         """
         return hashlib.sha256(self.text.encode()).hexdigest()
 
@@ -551,13 +560,14 @@ class Scenario(Frozen, frozen=True, dict=True):
     def links_random(self) -> bool:
         """True if a link draws its delays, losses or duplicates at random during the run.
 
-        A link may also do so only after a planned change.
+        This includes links that do so only after a planned change. Results then depend on the
+        seed, and one run is only an example.
         """
         return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
-        """True if at least one link has no artificial delay; the real network then decides.
+        """True if at least one link has no artificial delay, but that of the real network.
 
         Such a scenario can only run live.
         """
@@ -573,18 +583,19 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the first site with the role "slave".
+        """Name of the slave, the site whose arm works at the environment.
 
-        It is the name of the last site if no site has this role.
+        If several sites have the role "slave", it is the first of them. If none has, it is the
+        last site of the scenario.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Names of the sites whose arms are real robots.
+        """Names of the sites whose arms are real robots, with motion that is measured.
 
-        The motion of such an arm is measured. Empty if there are none.
+        A simulation cannot run these sites. Empty if there are none.
         """
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
@@ -592,7 +603,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def open_hands(self) -> tuple[str, ...]:
         """Names of the sites whose arms any member of the session may move.
 
-        A member is a process that takes part in the session.
+        A member is a process that takes part in the session, such as a page or a bridge. The
+        arm of a user's program is not open: that program alone moves it.
         """
         return tuple(
             name
@@ -854,10 +866,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         ]
 
     def without_hands(self) -> "Scenario":
-        """Returns the same experiment without operators.
+        """Returns the same experiment without the persons or programs who move the arms.
 
-        Operators are the persons or programs who move the arms. Walls and other environments
-        remain.
+        Walls and other environments remain. Values that were drawn at random for operators are
+        left out of the list of drawn values.
         """
         sites = {
             name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()

@@ -184,7 +184,7 @@ class _Edge(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """True if the joint can move a link of an arm."""
+        """True if the joint can move a link of an arm. A fixed joint cannot."""
         return self.kind in _MOVING_KINDS
 
 

@@ -243,13 +243,19 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`."""
+        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`.
+
+        A function is executed again for each call, even if the arguments are the same.
+        """
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     @property
     def workers(self) -> int:
-        """Number of items that all workers together run at the same time."""
+        """Number of items that all workers together run at the same time, one per thread.
+
+        The number may change, because workers may join and leave.
+        """
         workers = self._client.scheduler_info()["workers"]
         return sum(worker["nthreads"] for worker in workers.values())
 

@@ -68,7 +68,7 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Ignores a report of progress. Callers without a progress display use this function."""
+    """Ignores a report of progress: a default for callers that have no progress display."""
 
 
 class _BatchResult(NamedTuple):

@@ -142,7 +142,10 @@ _NO_LAWS = ("conditions", "interface", "sent_vectors")
 
 
 def list_laws() -> list[str]:
-    """Lists the names of the built-in control laws, without importing their modules."""
+    """Lists the names of the built-in control laws, for help texts and error messages.
+
+    The names are those of the files, so that no module needs to be imported, which takes long.
+    """
     folder = str(Path(__file__).parents[2] / "laws")
     return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
 
@@ -486,7 +489,12 @@ def load_chosen_scenario(
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
-    """Returns the overrides of --set and --duration, in this order."""
+    """Returns the changes of the scenario that --set and --duration ask for, in this order.
+
+    Args:
+        overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
+        duration: Value of --duration, in s. It becomes "duration_s=10.0". None if absent.
+    """
     texts = list(overrides or [])
     if duration is not None:
         texts.append(f"duration_s={duration!r}")
@@ -494,15 +502,21 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Splits a text of names such as "adaptive,p_d". None gives an empty list."""
+    """Splits the names that an option lists: "adaptive, p_d" gives ["adaptive", "p_d"].
+
+    None, which stands for an absent option, gives an empty list.
+    """
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def list_used_options(context: typer.Context) -> list[str]:
     """Lists the options and arguments that the user wrote on the command line.
 
+    Commands use the list to refuse combinations: an option with its default value is no
+    conflict.
+
     Returns:
-        The first name of each, in the order of declaration.
+        The first name of each, for example "--seed", in the order of declaration.
     """
     used = []
     for param in context.command.params:
@@ -657,7 +671,11 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """The options of a command that runs a session on this machine and reports on it."""
+    """The options of a command that runs a session on this machine and reports on it.
+
+    The options override parts of the scenario (`load`), name the folder of the results, and say
+    what is written and printed.
+    """
 
     duration: DurationOption = None
     folder: Annotated[

@@ -108,12 +108,18 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Deadline of each message after the start of the session, shape (K,), in ns."""
+        """Time at which each message is due, in ns after the start of the session, shape (K,).
+
+        The player publishes each message at this time, scaled by the speed of playing.
+        """
         return self.rows[:, _TIME]
 
     @property
     def end_ns(self) -> int:
-        """Time at which the last message is due, in ns after the start of the session."""
+        """Time at which the last message is due, in ns after the start of the session.
+
+        An empty batch has no such time, and raises IndexError.
+        """
         return int(self.times_ns[-1])
 
     @property
@@ -186,7 +192,8 @@ class MessageBatch:
     def compact(self) -> "MessageBatch":
         """Copies the messages into a batch whose buffer contains only their payloads.
 
-        This frees memory if the batch is a small part of a large buffer.
+        A batch may be a small part of a large buffer, which stays in memory as long as the
+        batch. The copy frees the large buffer.
         """
         view = memoryview(self.data)
         spans = self.rows[:, _START:].tolist()

@@ -139,7 +139,10 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Histogram of the lateness: the time from the deadline of a message to its publication.
+    """Counts messages by their lateness: the time from the deadline to the publication.
+
+    Percentiles can be computed at any time from the counts, without storing every lateness. The
+    width of an interval is 1 us.
 
     Attributes:
         max_us: Largest lateness, in us.

@@ -261,7 +261,10 @@ def pack_string(text: str) -> bytes:
 
 
 class RosLogLevel(IntEnum):
-    """Severity of a line in the log of ROS, with the numbers that ROS 2 defines."""
+    """Severity of a line in the log of ROS, with the numbers that ROS 2 defines.
+
+    Events of a session become such lines. For example, an arm that diverged is an ERROR.
+    """
 
     INFO = 20
     WARN = 30
@@ -416,7 +419,11 @@ class _CdrReader:
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Decodes the next header: its stamp in ns on the sender's clock, and its frame."""
+        """Decodes a `std_msgs/msg/Header`, with which many messages begin.
+
+        Returns:
+            The time stamp in ns on the sender's clock, and the name of the coordinate frame.
+        """
         (whole_s,) = self.numbers("i")
         (rest_ns,) = self.numbers("I")
         return whole_s * NS_PER_S + rest_ns, self.text()
@@ -462,7 +469,9 @@ def read_joint_state(payload: bytes) -> RosJoints:
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
-    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray` of any shape.
+    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray` in the order of the message.
+
+    The layout, which states the sizes of the dimensions, is skipped.
 
     Raises:
         ValueError: The message cannot be decoded.

@@ -500,7 +500,10 @@ class VizChannels:
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes."""
+        """Upper bound for the size of the messages that are not written yet, in bytes.
+
+        The messages of a bucket are written when the bucket ends.
+        """
         return sum(buckets.max_pending_bytes for buckets in self._buckets)
 
 
@@ -516,7 +519,13 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
         return None
 
     def make_views(session: str, epoch_unix_ns: int, put: PutMessage) -> VizChannels:
-        """Creates the messages for viewers of one file."""
+        """Creates the messages for viewers of one file of the log.
+
+        Args:
+            session: Name of the session.
+            epoch_unix_ns: Start of the session, in ns since 1970.
+            put: Function that writes a message.
+        """
         return VizChannels(scenario, session, epoch_unix_ns, views_hz, put)
 
     return make_views

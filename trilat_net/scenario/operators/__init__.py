@@ -74,7 +74,8 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     def actor(self) -> TorqueSource:
         """Operator or environment, as a record for the compiled simulation.
 
-        From this record, the compiled simulation computes the torque on the arm.
+        The kernel cannot use Python objects. From this record of numbers, it computes the
+        torque on the arm in every tick.
         """
         return self._source()
 
@@ -117,7 +118,12 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """Operator or environment that acts only from the time `start_s` to the time `end_s`."""
+    """Operator or environment that acts only in an interval of time.
+
+    Attributes:
+        start_s: Start of the interval, in s after the start of the run.
+        end_s: End of the interval, in s. By default, the actor never stops.
+    """
 
     start_s: fields.NotNegative = 0.0
     end_s: fields.Positive = fields.MAX_QUANTITY

@@ -218,7 +218,8 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         """Checks that the recorded torques are in the order of time.
 
         Returns:
-            The setting `points` and the reason. None if there is no problem.
+            The setting `points` and the reason. None if every time is later than the previous
+                one.
         """
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")

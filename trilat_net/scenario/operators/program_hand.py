@@ -144,22 +144,27 @@ class HandSite(NamedTuple):
 
     @property
     def program(self) -> str:
-        """Name of the Python class that operates the arm, for example "my_policy:Reach"."""
+        """Name of the class that operates the arm, for example "my_policy:Reach".
+
+        If the scenario does not name a class, it is "a program".
+        """
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
     def has_separate_process(self) -> bool:
         """True if the program runs in a process of its own in a live session.
 
-        Otherwise it runs in the process of the site.
+        A slow program then does not delay the control loop. Otherwise the program runs in the
+        process of the site.
         """
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
     @property
     def source(self) -> str:
-        """Text that identifies the sender of the program's messages.
+        """Text by which a site recognises the messages of this program.
 
-        It consists of the class of the program and the hash of the scenario.
+        It consists of the class of the program and the hash of the scenario, for example
+        "my_policy:Reach 5cfbf3f16ec0c567". Both are cut to fit into a message.
         """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
