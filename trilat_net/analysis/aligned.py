@@ -104,10 +104,10 @@ class AlignedRecords(NamedTuple):
 
     @property
     def shared(self) -> Array:
-        """The coordinates that other sites receive from this site.
+        """Coordinates in which the sites follow each other, one row per tick.
 
-        They are the joint angles q, shape (K, n), or in task space the pose x of the end
-        effector, shape (K, m).
+        A site sends them to its peers. They are the joint angles q, shape (K, n), in rad, or in
+        task space the pose x of the end effector, shape (K, m).
         """
         return self.x if self.x.size else self.q
 
@@ -144,8 +144,8 @@ class AlignedRecords(NamedTuple):
     def nominal_s(self) -> Array:
         """Planned time of the tick in every row, rounded down to whole nanoseconds.
 
-        The shape is (K,), in s. The simulation compares these times with the start and end of
-        an external torque.
+        The shape is (K,), in s. The simulation compares exactly these times with the start and
+        the end of an external torque. `t_s` is not rounded, and may differ in the last digit.
         """
         time_ns = self._ticks * NS_PER_S // self.rate_hz
         return time_ns.astype(np.float64) * 1e-9
@@ -496,10 +496,11 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """Marks the tick periods in which no interpolated record determines the peer's motion.
+        """Marks the tick periods in which records alone determine the motion of the peer.
 
-        Both the present and the delayed motion of the peer are then known from its records. The
-        shape is (K - 1,), because K ticks bound K - 1 periods.
+        Both its present and its delayed motion must be known. In other periods some record is
+        missing and was interpolated, so that energies that depend on the peer are not judged. K
+        ticks bound K - 1 periods, so that the shape is (K - 1,).
         """
         now = self.now.known
         delayed = self.delayed.known

@@ -284,7 +284,9 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 class PeerLoss(NamedTuple):
-    """A span of time in which a site continued without a peer that it no longer heard.
+    """Span of time in which a site continued without a peer that it no longer heard.
+
+    The site then follows the remaining peers alone, which changes its dominance factors.
 
     Attributes:
         site: Name of the site.

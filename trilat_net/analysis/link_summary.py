@@ -169,7 +169,9 @@ class _Arrivals(NamedTuple):
     def first(self) -> "_Arrivals":
         """These arrivals without duplicates: only the first arrival of each sample is kept.
 
-        They are ordered by the number of the sample, which the sender counts from 0.
+        A site uses only the first one, so that statistics of delays must not count a sample
+        twice. The result is ordered by the number of the sample, which the sender counts from
+        0.
         """
         sample, rows = np.unique(self.sample, return_index=True)
         return _Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)

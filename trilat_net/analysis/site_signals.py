@@ -64,7 +64,7 @@ def external_torques(part: SiteLog) -> Array:
 
 
 class JointError(NamedTuple):
-    """The largest error |e| of some records.
+    """The largest error |e| among some records, with its place and time.
 
     Attributes:
         value: The error, in the unit of the shared coordinates.
@@ -163,9 +163,11 @@ def largest_remaining_error(part: SiteLog) -> Array:
 def settling_time_s(part: SiteLog) -> float | None:
     """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
 
+    From this time on, the arm stays close to its reference for the rest of the run.
+
     Returns:
         The time. 0 if no error ever exceeded the bound. None if the last record has an error
-        that exceeds it, or if there are no records.
+            that exceeds it, or if there are no records.
     """
     if not len(part):
         return None

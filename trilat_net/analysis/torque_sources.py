@@ -298,7 +298,7 @@ class TorqueSplit(NamedTuple):
     def environment(self) -> Array:
         """The torque of the environment, such as walls, on the arm, shape (K, n), in N m.
 
-        It is the sum of the continuous part and the part that is computed once per tick.
+        It is the sum of the continuous torque and the torque that is held over a tick.
         """
         return self.environment_now + self.environment_held
 

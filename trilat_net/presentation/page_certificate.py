@@ -107,7 +107,12 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
 
 
 def _lengthen_name(sentence: str) -> str:
-    """Returns a sentence of a certificate with the long name of the check that it is about."""
+    """Replaces the short name at the beginning of a sentence by a name for readers of the page.
+
+    `describe_certificate` begins each sentence with the name of the check that it is about and
+    a colon. The short names fit a terminal. A name that is not in `_LONG_NAMES` remains, as
+    does a sentence without a colon.
+    """
     name, colon, rest = sentence.partition(": ")
     return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
 

@@ -153,8 +153,9 @@ class SiteEnergy:
     def begin_s(self) -> float:
         """Time of the first tick at which the energy V_i of the site can be computed, in s.
 
-        V_i depends on the motion of the other sites since they sent the states that are in use.
-        If this motion is not recorded at any tick, the time is infinite.
+        V_i depends on the motion of the other sites since they sent the states that are in use,
+        which the first records do not contain. If this motion is not known at any tick, the
+        time is infinite.
         """
         known = []
         for view in self.followed.values():
@@ -367,8 +368,8 @@ class EnergyBalance:
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
         """The total energy of the arms in the stability proof over time, shape (T,), in J.
 
-        It is the sum of the energies of the sites, the processes that run one arm each. Every
-        site is weighted with its entry of `beta`.
+        V = sum_i beta_i V_i, where V_i is the energy of site i, and beta_i its entry of `beta`.
+        The theorem says that V never rises, unless an operator supplies energy.
         """
         return _sum(self.parts)
 
@@ -377,7 +378,8 @@ class EnergyBalance:
         """The part of the change of V that no known energy explains, shape (T,), in J.
 
         It is V - V(0) + dissipation - work, summed over the judged periods, which are those
-        that rest on records alone. It includes the work of sampling.
+        that rest on records alone. It includes the work of sampling, and should otherwise be
+        close to 0. A large residual shows that the records contradict each other.
         """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
@@ -439,7 +441,7 @@ class EnergyBalance:
         """The size of the energies in the balance, in J, with which its errors are compared.
 
         It is the largest magnitude that the total energy V, or the work of any source, reaches
-        during the run.
+        during the run. An error of 1 mJ is negligible for a scale of 100 J, but not for 1 mJ.
         """
         largest = []
         for energy in [self.V, *self.work.values()]:

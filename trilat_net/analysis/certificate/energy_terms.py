@@ -373,9 +373,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records in which the arm comes to rest, or has just done so, shape (K,).
+        """Marks the records in which the site brings its arm to rest, or did so, shape (K,).
 
-        The recorded torque may then differ from the torque that the control law demands.
+        The site then adds a braking torque, for example because a peer is silent. The recorded
+        torque may therefore differ from the torque of the control law, and must not be compared
+        with it.
         """
         records = self.records
         if records.rests.size:
@@ -416,7 +418,9 @@ class SiteMotion:
     def limited(self) -> Bools:
         """Marks each recorded torque that is at a limit of the joint, shape (K, n).
 
-        The limit is the largest torque or the largest change of the torque per tick.
+        The limit is the largest torque, or the largest change of the torque per tick. At a
+        limit, the arm may have received less than the control law demanded, contrary to a
+        premise.
         """
         low, high = self.torque_bounds
         c = self.constants

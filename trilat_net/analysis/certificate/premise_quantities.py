@@ -33,7 +33,7 @@ class FunctionalObstacle(Enum):
 
 
 class MissingFunctional(NamedTuple):
-    """Sites whose arms have no energy function V, for the same reason.
+    """Group of sites whose arms have no energy function V, all for the same reason.
 
     Attributes:
         obstacle: The reason.
@@ -72,17 +72,21 @@ class ParameterFault(Enum):
 
 
 class ParameterQuantities(NamedTuple):
-    """Quantities of the premise that the adaptive laws can learn the parameters of their arms.
+    """Evidence for the premise that the adaptive laws can learn the parameters of their arms.
 
     Attributes:
-        faults: Name of the site and reason, for each fault.
+        faults: Name of the site and reason, for each fault. The premise holds if there are
+            none.
     """
 
     faults: tuple[tuple[str, ParameterFault], ...]
 
 
 class GainQuantities(NamedTuple):
-    """Quantities of the premise that the gain Kd is the same everywhere, up to a factor.
+    """Evidence for the premise that the gain Kd is the same at all sites, up to a factor per
+    site.
+
+    The factors can be balanced by the weights of the sites in V. Other differences cannot.
 
     Attributes:
         Kd: Gain of each site per joint, in N m s/rad. In task space per coordinate, in N s/m.
@@ -96,7 +100,10 @@ class GainQuantities(NamedTuple):
 
 
 class WallQuantities(NamedTuple):
-    """Quantities of the premise that simulated walls generate no energy.
+    """Evidence for the premise that simulated walls generate no energy.
+
+    A wall whose force is computed once per tick generates energy. The damping of the arm may
+    remove more than that.
 
     Attributes:
         walls: The walls that were touched, with their energies and dampings.
@@ -117,7 +124,9 @@ class WallQuantities(NamedTuple):
 
 
 class DominanceQuantities(NamedTuple):
-    """Quantities of the premise on the dominance factors.
+    """Evidence for the premise that the dominance factors are constant and give weights for V.
+
+    A dominance factor is the weight with which a site follows a peer.
 
     Attributes:
         changing: Sites whose dominance factors change.
@@ -136,7 +145,9 @@ class DominanceQuantities(NamedTuple):
 
 
 class AgeRange(NamedTuple):
-    """Smallest and largest age of the samples that a site uses of a peer.
+    """Range of the ages of the samples that one site uses of another one.
+
+    The age is the time since the sample was sent: the delay that the control law sees.
 
     Attributes:
         peer: Site that sends the samples.
@@ -152,10 +163,10 @@ class AgeRange(NamedTuple):
 
 
 class DelayQuantities(NamedTuple):
-    """Quantities of the premise that the delay of every link is constant.
+    """Evidence for the premise that the delay of every link is constant.
 
     Attributes:
-        varying: Ages on the links whose delay varies.
+        varying: Ages on the links whose delay varies. The premise holds if there are none.
         constant_s: Delay of each of the other links that delivered a sample, in s.
     """
 
@@ -178,7 +189,7 @@ class Interruption(NamedTuple):
 
 
 class FollowingQuantities(NamedTuple):
-    """Quantities of the premise that every site follows its peers.
+    """Evidence for the premise that every site follows its peers during the whole run.
 
     Attributes:
         interruptions: Times at which sites held, braked, returned or had stopped.
@@ -193,12 +204,12 @@ class FollowingQuantities(NamedTuple):
 
 
 class CutTorque(NamedTuple):
-    """A site whose torque was cut off at the limit of its actuators.
+    """A site whose actuators could not deliver the torque that its control law demanded.
 
     Attributes:
         site: Name of the site.
-        joints: Names of the joints. Empty if the joints have no names.
-        ticks: Number of ticks.
+        joints: Names of the joints concerned. Empty if the joints have no names.
+        ticks: Number of ticks in which a torque was cut off at its limit.
     """
 
     site: str
@@ -224,7 +235,7 @@ class TouchedStop(NamedTuple):
 
     Attributes:
         site: Name of the site.
-        joints: Names of the joints. Empty if the joints have no names.
+        joints: Names of the joints that touched. Empty if the joints have no names.
         from_s: Time of the first contact, in s.
     """
 
@@ -244,7 +255,9 @@ class StopQuantities(NamedTuple):
 
 
 class AxisQuantities(NamedTuple):
-    """Quantities of the premise that followed sites follow along the same axes.
+    """Evidence for the premise that followed sites follow along the same axes.
+
+    It concerns sites in task space, whose end effectors may leave some axes free.
 
     Attributes:
         faults: Pairs (follower, followed site) with an axis that only the follower follows.
@@ -254,11 +267,15 @@ class AxisQuantities(NamedTuple):
 
 
 class SingularPoseQuantities(NamedTuple):
-    """Quantities of the premise that no arm came near a singular pose.
+    """Evidence for the premise that no arm came near a singular pose.
+
+    In such a pose the end effector cannot move in every direction, however fast the joints
+    turn.
 
     Attributes:
         near_s: Time from which the arm of a site was near a singular pose, in s, by site.
-        least_values: Least singular value of the Jacobian of each site, in m/rad.
+        least_values: Least singular value of the Jacobian of each site, in m/rad. Near a
+            singular pose it is close to 0.
     """
 
     near_s: Mapping[str, float]
@@ -288,7 +305,9 @@ class Supply(NamedTuple):
 
 
 class OperatorQuantities(NamedTuple):
-    """Quantities of the premise that operators and environments are passive.
+    """Evidence for the premise that operators and environments are passive.
+
+    A passive operator never returns more energy than it received. V may otherwise rise.
 
     Attributes:
         unmeasured: Sites with external arms, if no record tells who pushes them.
@@ -303,7 +322,9 @@ class OperatorQuantities(NamedTuple):
 
 
 class RecordQuantities(NamedTuple):
-    """Quantities of the premise that no records are missing.
+    """Evidence for the premise that no records are missing.
+
+    V cannot be computed where records are missing.
 
     Attributes:
         unjudged_s: Spans (start, end) in which records are missing although all sites were
@@ -347,7 +368,9 @@ class PresentStretch(NamedTuple):
 
 
 class PresenceQuantities(NamedTuple):
-    """Quantities of the premise that all sites are present during the whole run.
+    """Evidence for the premise that all sites are present during the whole run.
+
+    A site may leave a session and return. The theorem then applies to each stretch between.
 
     Attributes:
         absent: Spans of time during which sites were absent.
@@ -359,12 +382,14 @@ class PresenceQuantities(NamedTuple):
 
 
 class BooksQuantities(NamedTuple):
-    """Quantities of the premise that the energies that control laws declare add up.
+    """Evidence for the premise that the energies that control laws declare add up.
+
+    The declared energies must follow from the recorded torques and velocities.
 
     Attributes:
         site: Site whose law has the largest error.
         residual_j: This error, in J.
-        scale_j: Largest energy that occurs, in J.
+        scale_j: Largest energy that occurs, in J, with which the error is compared.
     """
 
     site: str
@@ -373,7 +398,10 @@ class BooksQuantities(NamedTuple):
 
 
 class BookedTorqueQuantities(NamedTuple):
-    """Quantities of the premise that control laws count the torque that the arms received.
+    """Evidence for the premise that control laws count the torque that the arms received.
+
+    A law that counts the torque it demanded, although the actuator delivered less, has wrong
+    energies.
 
     Attributes:
         cut: Sites whose torque was cut off at the limit of their actuators.
@@ -385,11 +413,14 @@ class BookedTorqueQuantities(NamedTuple):
 
 
 class SamplingQuantities(NamedTuple):
-    """Quantities of the premise that arms receive little energy that their laws do not count.
+    """Evidence for the premise that arms receive little energy that their laws do not count.
+
+    A torque is held over a tick while the arm moves on. The law, which sees the arm at ticks
+    only, does not count the energy that arises between.
 
     Attributes:
-        site: Site that received most of such energy.
-        leak_j: This energy, in J. It arises between ticks.
+        site: Site that received most of this energy.
+        leak_j: This energy, in J.
     """
 
     site: str

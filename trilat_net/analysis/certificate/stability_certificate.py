@@ -264,7 +264,7 @@ class Certificate(Result):
         """Sentences on everything that prevents a stable judgement or refutes it.
 
         They concern the end of the run, V, the roots at the end pose, the energies that control
-        laws declare, and the completeness of the log.
+        laws declare, and the completeness of the log. Empty for a stable run.
         """
         return self.decision.reasons
 

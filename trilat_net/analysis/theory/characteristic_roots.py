@@ -281,12 +281,15 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 
 
 class CharacteristicRoot(NamedTuple):
-    """A characteristic root, or a pair of conjugate roots.
+    """A characteristic root s, which stands for the motion exp(s t) of a mode.
+
+    A complex root comes with its conjugate, which is not listed.
 
     Attributes:
-        s: The root with a non-negative imaginary part, in 1/s.
+        s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
+            rate.
         multiplicity: Number of modes that share the root.
-        states: Names of the states that participate most, the largest first.
+        states: Names of the states that participate most, the largest first, such as "m1.q2".
     """
 
     s: complex

@@ -54,6 +54,8 @@ class FrequencyBand(NamedTuple):
 class Minima(NamedTuple):
     """A curve over frequency, sampled so finely that its minima are resolved.
 
+    An example is the least eigenvalue of a frequency response, whose negative bands matter.
+
     Attributes:
         w_rad_s: Frequencies, shape (F,), in rad/s.
         values: Values of the curve, shape (F,).

@@ -171,8 +171,8 @@ class OperatingConditions(NamedTuple):
     def has_forms(self) -> bool:
         """True if gains alone do not describe the control law of some site.
 
-        A site is a process that runs one arm. Examples are laws that store numbers, or send
-        waves. The coupled arms are then linearised in continuous time only.
+        Examples are laws that store numbers from tick to tick, or send waves. The coupled arms
+        are then linearised in continuous time only, and not tick by tick.
         """
         return any(form is not None for form in self.find_forms())
 

@@ -237,7 +237,7 @@ class PortAnalysis(NamedTuple):
 
     @property
     def speed(self) -> str:
-        """Symbol of the velocities at which operators move the arms, for tables and figures.
+        """Symbol of the velocity of a port, for tables and figures.
 
         It is "qd" for joints, and "xd" if end effectors follow each other.
         """

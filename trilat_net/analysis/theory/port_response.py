@@ -494,8 +494,9 @@ class Transparency(NamedTuple):
     def softest_nm_s_rad(self) -> float:
         """Mean impedance that the operator feels while the other arm is free, in N m s/rad.
 
-        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
-        which are weighted as on a logarithmic axis.
+        The smaller it is, the less the operator feels of the arms themselves. It is the
+        geometric mean of the impedance's magnitude over the frequencies of `band_hz`, which are
+        weighted as on a logarithmic axis.
         """
         return self._average_magnitude(self.free)
 
@@ -503,8 +504,9 @@ class Transparency(NamedTuple):
     def stiffest_nm_s_rad(self) -> float:
         """Mean impedance that the operator feels while the other arm is clamped, in N m s/rad.
 
-        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
-        which are weighted as on a logarithmic axis.
+        The larger it is, the harder a rigid obstacle feels. It is the geometric mean of the
+        impedance's magnitude over the frequencies of `band_hz`, which are weighted as on a
+        logarithmic axis.
         """
         return self._average_magnitude(self.clamped)
 

@@ -251,7 +251,8 @@ class TwinGrowth(NamedTuple):
     def hides_period(self) -> bool:
         """True if the delays repeat only after more time than the judged part of the run.
 
-        A trend over a part of the period of the delays says nothing about the whole period.
+        Pushes that died away in this part might then grow in the rest of the period. A decision
+        without a proof therefore stays open.
         """
         judged_s = self.to_s - self.from_s
         return self.delay_period_s is not None and self.delay_period_s > judged_s
@@ -260,8 +261,8 @@ class TwinGrowth(NamedTuple):
     def judged_bursts(self) -> float:
         """Mean number of bursts of lost samples in the judged part of the run.
 
-        That of the link with the fewest bursts counts. Infinite if no link loses samples in
-        bursts.
+        A trend over few bursts says little about the run with more of them. The link with the
+        fewest bursts counts. Infinite if no link loses samples in bursts.
         """
         if self.burst_interval_s is None:
             return math.inf
