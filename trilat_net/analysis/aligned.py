@@ -539,6 +539,9 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
     """Finds the last tick of a site at or before each of some times.
 
+    It relates sites whose control loops have different rates: a time of one site is looked up
+    in the records of another one.
+
     Args:
         records: Records of the site, with one row per tick.
         t_s: Times since the start of the session, shape (K,), in s.

@@ -160,7 +160,10 @@ class PlacedArm:
         return np.array([row_1, row_2])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the torque G(q) that holds the arm against gravity, shape (2, ...), in N m.
+        """Returns the torque G(q) that holds the arm against gravity, in N m.
+
+        It is the gradient of the potential energy with respect to the joint angles. The shape
+        is (2, ...), with one column per record.
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -1002,6 +1005,8 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
 
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     """Returns the positions of the base, the joints and the end effector, for drawing an arm.
+
+    Lines through these points, in their order, are the links.
 
     Args:
         arm: The arm.

@@ -50,7 +50,9 @@ def _find_cycle(link: LinkBase) -> Fraction | None:
 
 
 def find_link_period_s(link: LinkBase) -> float | None:
-    """Returns the period of a link's delay, in s.
+    """Returns the period after which the delay of a link repeats, in s.
+
+    For example, a sinusoidal delay of 0.5 Hz has a period of 2 s.
 
     Args:
         link: Delay model of the link.
@@ -165,6 +167,8 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _De
 
 def is_ending_trace(link: LinkBase) -> bool:
     """Returns True if a link plays a delay trace that does not start again at its end.
+
+    The delay after this end is not a repetition, so that the link has no period.
 
     Args:
         link: Delay model of the link.

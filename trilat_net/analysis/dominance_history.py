@@ -304,6 +304,9 @@ class PeerLoss(NamedTuple):
 def list_losses(log: Log) -> list[PeerLoss]:
     """Lists when sites continued without a peer that they no longer heard.
 
+    In these times the dominance factors differ from the planned ones, because a site gives the
+    share of the lost peer to the others.
+
     Args:
         log: The log of the run.
 
@@ -513,6 +516,9 @@ def left_perron_vector(alpha: Array) -> Array:
 
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
+
+    The stability proof allows arms with different gains if all joints have the same ratio: the
+    weights of the arms in V then balance it.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an

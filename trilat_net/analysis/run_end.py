@@ -827,6 +827,9 @@ def _count_sign_changes(values: Array) -> int:
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     """Groups the sites that follow each other at any time, directly or through further sites.
 
+    Only sites of the same group are expected to agree at the end of a run. For example, m1 and
+    s are in one group with m2 if s follows both masters.
+
     Args:
         scenario: Scenario of the run, with the changes of its dominance factors.
 
@@ -984,6 +987,9 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
     """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
+
+    An arm whose controller does not hold it comes to rest as well, but must not count as
+    stable.
 
     Args:
         scenario: The description of the experiment, with the start poses.

@@ -148,6 +148,8 @@ def largest_magnitude(values: Array) -> Array:
 def largest_remaining_error(part: SiteLog) -> Array:
     """Returns for each record the largest error of any joint from there to the end.
 
+    The arm has settled where this value falls below a bound.
+
     Args:
         part: Log of the site.
 
@@ -199,6 +201,9 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
     """Returns how far operators displaced a site, compared with a run without operators.
+
+    Arms also move without operators, for example while they synchronise. The difference of both
+    runs is the motion due to the operators alone.
 
     Args:
         log: The log of the run.

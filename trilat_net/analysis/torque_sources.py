@@ -50,6 +50,8 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
     """Returns how deep an end effector is in a virtual wall, in m.
 
+    The force of the wall grows with the depth. Outside the wall there is no force.
+
     Args:
         wall: The wall.
         end_effector: Motion of the end effector over K poses.

@@ -209,6 +209,8 @@ class Account:
     def refill(self, number: int) -> bool:
         """Counts a message that the sender sent again from its memory, as requested.
 
+        A recorder requests missing messages. A message that arrives in this way closes its gap.
+
         Args:
             number: Number of the message in its channel.
 
@@ -287,6 +289,9 @@ class Account:
 
     def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
         """Finds the first missing messages that can still be requested from the sender.
+
+        Messages that no member has any more are left out, so that they are not requested again
+        and again.
 
         Args:
             number: Smallest number to consider.
@@ -491,6 +496,8 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 
 def parse_counts(account: str) -> dict[str, int]:
     """Reads the numbers of received and missing messages from a line of `Account.describe`.
+
+    A finished log stores the counts as such lines, for people and for programs.
 
     Args:
         account: The line, as a log stores it for each topic.

@@ -53,7 +53,9 @@ _CHECKED_MESSAGES = 20
 
 
 class MessageOrigins(NamedTuple):
-    """Sessions and senders of a set of messages.
+    """Sessions and senders from which a set of messages comes.
+
+    A log has messages of a single session. Further sessions reveal parts of another file.
 
     Attributes:
         epochs_ns: Start times of the sessions, in Unix time, in ns.

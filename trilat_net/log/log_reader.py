@@ -483,6 +483,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def account(self, site: str) -> str:
         """Returns how many records of a site were received and how many are missing.
 
+        The recorder counted them. They need not agree with the file if the file is damaged.
+
         Args:
             site: Name of the site.
 
@@ -785,7 +787,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
-        """Decodes the statistics that a site published about its links.
+        """Decodes the statistics that a site published about its links, such as losses.
 
         Args:
             site: Name of the site.
@@ -796,7 +798,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Decodes the statistics that a site published about its links to other sites.
+        """Decodes the statistics that a site published about its links, with their times.
 
         Args:
             site: Name of the site, the process that runs one arm.

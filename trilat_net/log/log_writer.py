@@ -74,7 +74,7 @@ class _LogViews(Protocol):
         """
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages, at the end of the log.
+        """Writes the remaining messages for viewers, at the end of the log.
 
         Args:
             log_ns: Arrival time of the last message of the session, in Unix time, in ns.
@@ -242,7 +242,7 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message, unless the filter excludes its channel.
+        """Adds one message of the session to the log, unless the filter excludes its channel.
 
         Args:
             key: Key of the channel.

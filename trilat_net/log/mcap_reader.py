@@ -621,6 +621,8 @@ def read_contents(
 def check_log(stream: BinaryIO, name: str) -> None:
     """Reads a log once without storing its messages, to find out whether it can be opened.
 
+    A log of any length can be checked with little memory.
+
     Args:
         stream: The file, opened for reading.
         name: Name of the file for error messages.

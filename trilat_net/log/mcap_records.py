@@ -203,7 +203,7 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Finds the records in an unpacked chunk, one after another.
+    """Finds the records in an unpacked chunk, one after another, without decoding them.
 
     Args:
         data: The unpacked chunk.
@@ -255,6 +255,8 @@ class RecordFrame(NamedTuple):
 
 class Damage(NamedTuple):
     """A part of a file that cannot be read, and the reason.
+
+    A scan continues after the part. Checks report it, and a recovery counts its bytes as lost.
 
     Attributes:
         offset: Offset of the part's first byte in the file.
@@ -586,7 +588,7 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Checks the content of an attachment by the checksum at its end.
+    """Checks the content of an attachment, such as the scenario, by the checksum at its end.
 
     Args:
         attachment: Content of the attachment's record.

@@ -171,6 +171,8 @@ def _recorder_boot(part: LogContents) -> int:
 def identify_session(part: LogContents) -> dict[str, str]:
     """Collects the facts that identify a session, on which all parts of its log agree.
 
+    Files can be read as one log only if these facts are equal.
+
     Args:
         part: Contents of one part.
 

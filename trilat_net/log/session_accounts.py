@@ -356,6 +356,9 @@ class SessionAccounts:
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
         """Lists the ranges of missing numbers of a topic, over all starts of its sender.
 
+        Events are numbered from 0 again at each start of their sender. Each start then has an
+        account of its own, and all of them are considered.
+
         Args:
             topic: Topic of the channel.
 

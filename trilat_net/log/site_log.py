@@ -259,7 +259,7 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class TimedMessages(NamedTuple, Generic[M]):
-    """Messages of a log with their arrival and sending times.
+    """Messages of a log with the times at which they were sent and at which they arrived.
 
     Attributes:
         messages: The K messages.

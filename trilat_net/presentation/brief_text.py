@@ -87,6 +87,8 @@ def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
 def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields a table with the ten most important numbers of a run, each with its subject.
 
+    The subject is the whole run, or the site or link with the worst value.
+
     Args:
         metrics: All numbers of the run.
     """

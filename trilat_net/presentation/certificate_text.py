@@ -262,7 +262,7 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_theorem(certificate: Certificate) -> list[str]:
-    """Returns a line that says what the paper's stability theorem says about a run.
+    """Returns a line on what the paper's stability theorem says about a run.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.

@@ -43,7 +43,9 @@ class ColumnTable(msgspec.Struct, frozen=True):
 
 
 class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of a chart over time. It draws one column of a `ColumnTable`.
+    """A line of a chart over time, which draws one column of a `ColumnTable`.
+
+    Several charts may draw from the same table, so that the page contains its numbers once.
 
     Attributes:
         label: Name of the line in the legend.
@@ -250,6 +252,8 @@ class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
 
 class MarkedChange(msgspec.Struct, frozen=True):
     """A change during the run that charts mark, such as another delay of a link.
+
+    The number n connects the mark with the row of the table that explains the change.
 
     Attributes:
         n: Number in the table of changes.

@@ -79,7 +79,9 @@ def caption_site(scenario: Scenario, site: str) -> str:
 
 
 def trace_leads(log: Log) -> list[_Lead]:
-    """Traces with which weights each slave follows its peers.
+    """Traces with which weights each slave follows its peers over the run.
+
+    The bars, the sentences and the slider of the page use the same data.
 
     Args:
         log: Log of the run.

@@ -210,6 +210,8 @@ def site_title(log: Log, site: str) -> str:
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
     """Draws a signal over time with fewer points, such that all extremes stay visible.
 
+    A run has up to millions of values, far more than a figure has pixels.
+
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         tick: Ticks of the values, shape (K,).
@@ -223,6 +225,8 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
 
 def positive(values: Array) -> Array:
     """Replaces zero and negative values by NaN, as a logarithmic axis cannot show them.
+
+    A line has a gap at NaN, while zero would draw it to the edge of the panel.
 
     Args:
         values: The values.
@@ -454,6 +458,8 @@ def add_joint_panels(
 
 def typeset(text: str) -> str:
     """Replaces "+-" and "->", as the terminal shows them, by the signs ± and →.
+
+    For example "m1->s: 3 +- 1" becomes "m1 → s: 3 ± 1".
 
     Args:
         text: A text for the terminal.

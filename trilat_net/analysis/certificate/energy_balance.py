@@ -508,7 +508,7 @@ def compute_energy_balance(
     all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
-        """Returns the energies of a kind over time, summed over the judged periods.
+        """Returns the energies of a kind over time, each accumulated over the judged periods.
 
         Args:
             kind: The kind, such as "dissipation" or "work".
@@ -732,6 +732,9 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
 
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above its smallest earlier value, at each time.
+
+    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. An energy that first falls and then
+    rises must not hide the rise behind the fall.
 
     Args:
         values: Values of the quantity over time, shape (T,).

@@ -318,6 +318,9 @@ class SiteMotion:
     def law_torque(self, rows: Ints) -> Array:
         """Returns the torque that the control law demands, before it is limited.
 
+        The torque is computed again from the records. A difference from the recorded torque
+        shows that the records are false, or that the torque was cut off.
+
         Args:
             rows: Rows of the records at which the law is evaluated, shape (K,).
 
@@ -530,7 +533,10 @@ class FunctionalParts(NamedTuple):
 
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
-    """Computes the energy of a site in the stability proof at each of its K records.
+    """Computes the energy V_i of a site in the stability proof at each of its K records.
+
+    The module's docstring has the equation. The parts are returned separately, because figures
+    and the certificate show them.
 
     Args:
         site: Motion of the site.

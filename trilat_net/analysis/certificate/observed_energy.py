@@ -181,7 +181,7 @@ class _SiteBooks(NamedTuple):
 
 
 def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that declare energies, by site.
+    """Returns the control laws that declare energies, such as the level of a tank, by site.
 
     Args:
         scenario: Scenario of the run.

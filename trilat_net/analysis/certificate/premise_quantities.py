@@ -83,8 +83,7 @@ class ParameterQuantities(NamedTuple):
 
 
 class GainQuantities(NamedTuple):
-    """Evidence for the premise that the gain Kd is the same at all sites, up to a factor per
-    site.
+    """Evidence for the premise that the gain Kd is equal at all sites, up to a factor each.
 
     The factors can be balanced by the weights of the sites in V. Other differences cannot.
 
@@ -337,7 +336,7 @@ class RecordQuantities(NamedTuple):
 
 
 class AbsentSpan(NamedTuple):
-    """A span of time during which a site was absent from the session.
+    """A span of time in which a site was absent from the session and executed no ticks.
 
     Attributes:
         site: Name of the site.
@@ -351,7 +350,10 @@ class AbsentSpan(NamedTuple):
 
 
 class PresentStretch(NamedTuple):
-    """A stretch of time during which all sites were present.
+    """A stretch of time between two absences, in which all sites were present.
+
+    The stability theorem can apply to a stretch only from the time at which all sites follow
+    again.
 
     Attributes:
         from_s: Start, in s.

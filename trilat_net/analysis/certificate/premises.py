@@ -173,7 +173,9 @@ def _find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function of the stability proof does not exist.
+    """Explains for which arms the energy function V of the stability proof does not exist.
+
+    A certificate then judges the run without V.
 
     Args:
         scenario: The description of the experiment.
@@ -828,6 +830,8 @@ class Evidence(NamedTuple):
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     """Collects how complete the records of a run are, and whether its log is unchanged.
+
+    A run of which too little is known is not called stable, see `Evidence.reasons`.
 
     Args:
         run: Facts of the run, computed by `gather_facts`.

@@ -122,7 +122,7 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores a record in the window.
+        """Stores a record at the row of its tick. Records may arrive in any order.
 
         Args:
             record: The record.
@@ -237,13 +237,15 @@ class RecordWindow:
 
 
 class EnergyCourse(NamedTuple):
-    """The energy function V of the stability proof over a span of time.
+    """The energy function V of the stability proof, over a span of time of a running session.
+
+    A live display shows V and the energy that was supplied: V may rise only by the latter.
 
     Attributes:
         t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.
         V: The energy function, shape (T,), in J.
         supplied: Work of operators and environments since the first computed time, shape (T,),
-            in J. V may rise only by this work.
+            in J.
     """
 
     t_s: Array

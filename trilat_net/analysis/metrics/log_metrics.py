@@ -101,6 +101,8 @@ class LogMetrics(Result):
     def label(self, number: int) -> str:
         """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
 
+        The name of a joint is added to its number if all arms name their joints alike.
+
         Args:
             number: Number of the joint or axis, from 1.
         """
@@ -372,6 +374,9 @@ def find_quantity(key: str) -> Quantity:
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
 def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
     """Computes only some quantities of a whole run, which is faster than all of them.
+
+    Other commands need a few numbers of many runs, for example to compare the points of a
+    sweep.
 
     Args:
         log: The log of the run.

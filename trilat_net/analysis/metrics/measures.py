@@ -46,7 +46,9 @@ _NOT_FINITE = "the number is not finite"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Wraps a number in a metric, which also says why a number is missing.
+    """Wraps a number in a metric. A missing number, or one that is not finite, gets a reason.
+
+    For example, metric(nan, "no contact") has the value None and the reason "no contact".
 
     Args:
         value: The number. None if there is none.
@@ -130,7 +132,9 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square of the column for which it is largest.
+    """Returns the root mean square over time of the column for which it is largest.
+
+    With a column per joint, this is the RMS value of the worst joint.
 
     Args:
         values: Values of n quantities over time, shape (K, n).

@@ -163,7 +163,9 @@ class Pencil(NamedTuple):
         return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Evaluates the characteristic matrix Delta(s) and its derivative.
+        """Evaluates the characteristic matrix Delta(s) of the loop and its derivative.
+
+        Newton's method needs both to refine a root, at which Delta(s) is singular.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -762,6 +764,8 @@ def chebyshev_nodes(order: int) -> Array:
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
     """Returns the matrix that interpolates values at the Chebyshev nodes at other points.
+
+    Its product with the values at the nodes is the value of the polynomial at the points.
 
     Args:
         order: Degree of the polynomial.

@@ -148,7 +148,7 @@ class DelayMargin(NamedTuple):
 
 
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a loop with the same delay on all of its links.
+    """Returns a loop with the same delay on all of its links, for example to check a margin.
 
     Args:
         loop: The loop.

@@ -147,6 +147,9 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 class LinearEdge(NamedTuple):
     """A value of a scenario's key at which a loop becomes stable or unstable.
 
+    At this value a characteristic root crosses the imaginary axis, and small motions oscillate
+    with the frequency of the root.
+
     Attributes:
         key: Key of the scenario, such as "control.d".
         value: Value of the key at the edge, in the unit of the key.

@@ -112,6 +112,9 @@ class _EndLoop(NamedTuple):
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     """Computes whether small motions about the end pose of a recorded run die away.
 
+    The coupled arms are linearised at the pose at rest next to the last one. The result may
+    prove the run stable, or refute it.
+
     Args:
         log: The log of the run.
         own_laws: True if the code of imported control laws may be executed. Otherwise a loop
@@ -129,6 +132,9 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
 
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     """Computes whether small motions about the end pose of a simulated run die away.
+
+    The result is that of `find_log_roots` for a log of the same run, but no log is needed.
+    Studies with many runs use this function.
 
     Args:
         scenario: The experiment.

@@ -245,7 +245,7 @@ def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
 
 
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
-    """Finds the ports of a site, the joints at which its operator acts.
+    """Finds the ports of a site, the joints at which its operator acts on the loop.
 
     Args:
         loop: The loop.
@@ -279,6 +279,8 @@ def _parse_port_joint(port: str) -> int:
 
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
     """Groups the ports of a loop by the number of their joint, in the order of the sites.
+
+    Ports of the same joint can be analysed together, apart from the other joints.
 
     Args:
         loop: The loop.

@@ -309,6 +309,9 @@ def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
     """Encodes the response of a ROS service of the type `std_srvs/srv/Trigger`.
 
+    Such a service does something, for example it stops an arm, and reports whether it
+    succeeded.
+
     Args:
         success: True if the request was carried out.
         text: Explanation for the caller of the service.
@@ -318,6 +321,8 @@ def pack_trigger_response(*, success: bool, text: str) -> bytes:
 
 class Diagnosis(NamedTuple):
     """Status of one component, as a message of the ROS topic `/diagnostics` reports it.
+
+    Monitors of robots show these statuses, with a colour for each level.
 
     Attributes:
         level: 0 if the component is ok, 1 for a warning, 2 for an error, 3 if the status is too

@@ -133,7 +133,7 @@ def _rotate_about(axis: Vector, angle: float) -> Quaternion:
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
-    """Converts a rotation vector to a unit quaternion.
+    """Converts a rotation vector to a unit quaternion (x, y, z, w).
 
     Args:
         rotation_vector: Axis of the rotation times its angle, in rad.

@@ -126,6 +126,8 @@ def _add_link_panels(
 def has_varying_delay(log: Log) -> bool:
     """Tells whether the delays of a run vary, so that their distribution is of interest.
 
+    Figures and pages leave the distribution out otherwise.
+
     Args:
         log: Log of the run.
 
@@ -263,6 +265,8 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 def is_unsteady(ages_ms: Array) -> bool:
     """Tells whether ages fluctuate so often that a line would look like a filled area.
+
+    The figure then draws the spread of the ages as a band.
 
     Args:
         ages_ms: Ages over time, shape (K,), in ms.
