@@ -258,10 +258,10 @@ class ProcessStarter:
                         os.kill(process.pid, signal.SIGINT)
 
     def close(self) -> None:
-        """Ends the starter, the process that starts all other processes of the session.
+        """Ends the starter, the child process that starts all other processes of the session.
 
         The method must be called after all other processes have ended, because nobody could
-        start or signal processes any more.
+        signal them any more.
         """
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)

@@ -235,8 +235,8 @@ class SessionDisplay:
     def due(self) -> bool:
         """True if enough time has passed since the last update of the display.
 
-        Updates are limited in rate, because drawing a terminal takes time and no reader could
-        follow.
+        A table in a terminal is updated more often than lines in a file. Drawing takes time,
+        and no reader could follow faster changes.
         """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns

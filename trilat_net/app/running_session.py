@@ -70,7 +70,7 @@ SOURCE = "the operator"
 
 
 def _never_stopped() -> bool:
-    """Returns False, as the function `stopped` of calls that are ended only by a time limit."""
+    """Returns False: the function `stopped` for calls that nothing but a time limit ends."""
     return False
 
 

@@ -131,7 +131,10 @@ class SessionPing:
 
     @property
     def _boots(self) -> set[int]:
-        """Numbers that identify the members that have replied. Their pings are evaluated."""
+        """Random numbers (boots) of the processes that have replied as members of the session.
+
+        Only pings of these processes are evaluated.
+        """
         return {info.boot for info in self.infos.values()}
 
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:

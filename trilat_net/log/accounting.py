@@ -76,7 +76,10 @@ class RangeSet:
         self._forget_lowest()
 
     def _forget_lowest(self) -> None:
-        """Removes the ranges with the lowest numbers if there are more than permitted."""
+        """Removes the ranges with the lowest numbers if there are more than permitted.
+
+        Thus the memory stays bounded, whatever a sender does (L6).
+        """
         del self._ranges[: -self._max_ranges]
 
     def remove(self, number: int, last: int | None = None) -> bool:

@@ -417,7 +417,10 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that the site's control law sends to its peers."""
+    """Yields the columns of the numbers that the site's control law sends to its peers.
+
+    Their names begin with "ch_". For example "ch_force_m1_nm" is a torque that is sent to m1.
+    """
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
         stem = f"ch_{name}"

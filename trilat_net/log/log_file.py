@@ -345,7 +345,10 @@ class LogFile:
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes the data of an incomplete flush, so that the file ends at the one before."""
+        """Removes the data of an incomplete flush, so that the file ends at the previous flush.
+
+        A log that ends with half a chunk could only be read after a recovery.
+        """
         self._broken = True
         self._pending = bytearray()
         self._written = 0

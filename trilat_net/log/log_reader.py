@@ -431,10 +431,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of this file, if the recorder split the log into several files.
+        """Number of this file, from 1, if the recorder split the log into several files.
 
-        The first part has the number 1. The number is 0 for a log in a single file, and for
-        several files that were opened together.
+        It is 0 for a log in a single file, for several files that were opened together, and for
+        a file without a valid number.
         """
         if len(self.sources) > 1:
             return 0
@@ -514,7 +514,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of ticks that each site states in its "end" event, at most the scenario's."""
+        """Number of ticks that each site states in its "end" event, by site.
+
+        A number above that of the scenario is reduced to it. Sites without such an event are
+        missing.
+        """
         ticks = {}
         for event in self.events:
             if event.kind == "end" and event.member in self.scenario.sites:
@@ -633,7 +637,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return max(ticks, recorded) - self.absent_ticks(site)
 
     def _is_gone(self, site: str) -> bool:
-        """Returns True if the latest news about a site is that it was lost or left."""
+        """Returns True if the latest news about a site is that it was lost or left.
+
+        The other sites publish this news as events.
+        """
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
         if not events:
@@ -875,7 +882,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def tables(self) -> Iterator[Table]:
         """Yields every table of the log, for example to export all of them.
 
-        The tables of each site come first, then that of the events. Only one of them is in
+        The tables of each site come first, then the table of the events. Only one of them is in
         memory at a time.
         """
         for site in self.sites:

@@ -227,8 +227,8 @@ class LogWriter:
     def most_bytes(self) -> int:
         """Largest size of the file if it were finished now, in bytes.
 
-        The numbers of received and missing messages, which `finish` also writes, are not
-        included.
+        It shows whether a further message still fits into a part of limited size. The numbers
+        of received and missing messages, which `finish` also writes, are not included.
         """
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
@@ -289,9 +289,7 @@ class LogWriter:
         self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
 
     def flush(self) -> None:
-        """Passes all messages so far to the operating system.
-
-        They are not lost if the process crashes afterwards.
+        """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
         Raises:
             LogRefused: The disk refused the data.

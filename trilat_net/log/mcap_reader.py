@@ -239,7 +239,7 @@ class McapReader:
         yield from self._walk()
 
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
-        """Yields what the scanner finds, and keeps the position and the progress."""
+        """Yields what the scanner finds, and updates the position and the reported progress."""
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
                 yield item
@@ -283,7 +283,10 @@ class McapReader:
 
     @property
     def _gave_up(self) -> bool:
-        """True if there were so many damaged parts that no more records are read."""
+        """True if the file has so many damaged parts that the reader has stopped.
+
+        The limit bounds the time and the memory that a file of random bytes can cost.
+        """
         return self._is_scanned and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _unpack(self, record: mcap_records.ScannedRecord) -> bytes:

@@ -52,10 +52,10 @@ the end of the data, the footer and the end mark.
 
 
 class Sink(Protocol):
-    """A file, or a buffer that keeps the bytes until `flush` is called.
+    """Where the writer puts the bytes of the file: a file, or a buffer that waits for `flush`.
 
     If the sink has a method `reserve(size)`, the writer calls it with the number of bytes that
-    the end of the file will need.
+    the end of the file will need. Disk space for them can then be reserved.
     """
 
     def write(self, data: bytes, /) -> int:

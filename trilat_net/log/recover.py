@@ -923,7 +923,11 @@ class _FileCopy:
         return ""
 
     def _report_final_losses(self) -> None:
-        """Adds the losses that are known only after all records were read."""
+        """Adds the losses that are known only after all records were read.
+
+        For example, messages of a channel that no record defines, because a definition may
+        follow its messages.
+        """
         result = self._result
         for number, count in self._unnamed.items():
             result.add_loss(

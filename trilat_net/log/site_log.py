@@ -678,7 +678,7 @@ class SiteLog:
         """Computing time of each tick except the last one, shape (K - 1,), in us.
 
         A record contains the computing time of the tick before, because its own is not known
-        yet when the record is published.
+        yet when the record is published. The values are moved by one row accordingly.
         """
         return self.numbers("busy_us")[1:]
 

@@ -374,7 +374,11 @@ _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 
 
 def _mark_twins(twins: TwinGrowth) -> str:
-    """Returns the mark of the sentence about twins, see `CertificateLine`."""
+    """Returns the mark of the sentence about twins: "ok" if all pushes die away.
+
+    It is "FAIL" if a push grows or its repetition leaves the run, "note" without pushes, and
+    "open" otherwise.
+    """
     if not twins.pushes:
         return "note"
     if twins.grows or twins.departure is not None:
@@ -449,7 +453,11 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of V that no listed energy explains, shape (T,), in J."""
+    """Returns the change of V that no listed energy explains, shape (T,), in J.
+
+    The table of energies lists it as "unexplained". It should be close to 0, except in gaps of
+    the records.
+    """
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
     explained = gained - lost + balance.sampling - balance.transfer

@@ -65,6 +65,8 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
 class HistogramSeries(msgspec.Struct, frozen=True):
     """A line of a histogram, which shows how often the times of a site lie in each bin.
 
+    The bins belong to the chart, and are the same for all of its lines.
+
     Attributes:
         label: Name of the line in the legend.
         colour: Colour of the line.

@@ -116,7 +116,10 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that a line through the other points would miss."""
+    """Returns the indices of the points that are needed to draw the shares as a line.
+
+    Points on a straight line between others are left out. The first and the last are kept.
+    """
     slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
     turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
     corners = np.flatnonzero(turns > _SAME_SHARE) + 1

@@ -286,7 +286,11 @@ def _format_per_joint(values: Any, units: Sequence[str]) -> str:
 
 
 def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
-    """Joins the texts of all joints, with the units, and shortens what is equal."""
+    """Joins the texts of all joints to one, and writes equal texts or units only once.
+
+    For example, the texts "1", "1" with the unit "rad" give "1 rad", and "1", "2" give "1, 2
+    rad".
+    """
     if len(set(units)) > 1:
         return ", ".join(f"{text} {unit}" for text, unit in zip(texts, units, strict=True))
     return f"{texts[0] if len(set(texts)) == 1 else ', '.join(texts)} {units[0]}"

@@ -95,8 +95,9 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yields each quantity that is checked in this part of a run, with its limits.
 
-        Each item is the name of the quantity, whose ending states the unit, and a pair of the
-        smallest and the largest permitted value. Yields nothing if no quantity is checked.
+        An item is, for example, the name of a quantity, which ends in its unit, and the pair
+        (0.0, 0.01) of the smallest and the largest permitted value. Yields nothing if no
+        quantity is checked.
         """
         for key in _QUANTITIES:
             limits = getattr(self, key)

@@ -74,7 +74,11 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
 
 
 def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
-    """Returns overrides in which a table for a whole group is replaced by its single keys."""
+    """Replaces each override of a whole group of keys by overrides of the single keys.
+
+    For example, `limits={q_max_rad=3}` becomes `limits.q_max_rad=3`, so that other keys of the
+    group keep their values.
+    """
     flat_pairs: list[Override] = []
     for key, value in pairs:
         is_group = key in SITE_GROUPS or key in _KIND_KEYS

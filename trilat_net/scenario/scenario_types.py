@@ -99,7 +99,8 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     def rule(self) -> site_setup.StaleRule:
         """Reaction to missing messages of another site, as a record for the control loop.
 
-        A site is the process that runs one arm. Times in the record are in ns.
+        The scenario states times in ms, and the record in whole ns, because the kernel computes
+        with integers.
         """
         if self.action == "glide":
             return site_setup.StaleRule(
@@ -163,10 +164,10 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> site_setup.MotionLimits:
-        """Limits of joint angles, reference speed and torque rate, for the control loop.
+        """Limits of joint angles, reference speed and torque rate, as a record for the kernel.
 
-        This is the record that the compiled control loop reads. A limit that the author of the
-        scenario left out is infinite.
+        A limit that the author of the scenario left out is infinite, so that the kernel needs
+        no special case.
         """
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -251,9 +252,9 @@ TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
 class Change(RecordedChange, frozen=True, omit_defaults=True):
     """Change of a link or of dominance factors, or a command to a site.
 
-    A scenario plans changes in its timeline; users request further ones during a run. Exactly
-    one of `link`, `dominance` and `site` is not empty. Only the changes in records of a run
-    have `site`.
+    A scenario plans changes in its timeline, and users request further ones during a run.
+    Exactly one of `link`, `dominance` and `site` is not empty, and says what is changed. Only
+    the changes in records of a run have `site`.
     """
 
     @property
@@ -434,8 +435,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def controls(self) -> tuple[ChosenLaw, ...]:
         """Control law of every site with its gains, in the order of the sites.
 
-        Some laws have gains that follow from the dominance factors at the start. A dominance
-        factor is the weight with which a site follows a peer. These gains are filled in.
+        Some laws have gains that follow from the dominance factors at the start, the weights
+        with which a site follows its peers. Here these gains are filled in.
         """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
@@ -541,7 +542,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns the links at the start and all their later states."""
+        """Returns the links at the start, and each state of a link after a planned change.
+
+        For example, a scenario is random if any of them is.
+        """
         later_links = [
             link for name in self.links for _, link in scheduled_links(self.timeline, name)
         ]
@@ -549,10 +553,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number of the experiment is random.
+        """True if any number of the experiment is random: another seed gives another run.
 
-        Then another seed gives another run. The numbers may be drawn when the scenario is
-        loaded, or during the run.
+        The numbers may be drawn when the scenario is loaded, or during the run.
         """
         return bool(self.drawn) or self.links_random
 
@@ -763,7 +766,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> site_setup.RestGains:
-        """Returns the gains of the controller that brings a site's arm to rest."""
+        """Returns the gains of the controller that brings a site's arm to rest.
+
+        It acts, for example, when a peer is silent. The gains depend on the arm, on the limit
+        of its torque, on the tick rate and on the damping that the control law already has.
+        """
         spec = self.sites[site]
         arm = self.arms[site]
         gains = spec.control.linear_gains(arm.theta) or spec.control.gains(arm.theta)
@@ -816,7 +823,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the sites that a site follows, as an integer with bit n set for site n."""
+        """Returns the sites that a site follows, as an integer with bit n set for site n.
+
+        For example, 0b101 for the first and the third site. The kernel needs this compact
+        format.
+        """
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:

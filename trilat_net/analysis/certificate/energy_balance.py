@@ -199,7 +199,12 @@ class SiteEnergy:
         return rule_error + self._estimate_coupled_error()
 
     def _estimate_coupled_error(self) -> float:
-        """Returns the energy of changes of r times changes of the torques, in J."""
+        """Returns an estimate of the energy that the trapezoid rule misjudges, in J.
+
+        Within a period, both the filtered error r and the torques change. The product of both
+        changes is not contained in the mean of the powers at its ends. The estimate is an upper
+        bound for the error of the balance.
+        """
         records = self.motion.records
         ends = self.motion.ends
         change_of_r = ends.r_right - ends.r_left
@@ -410,7 +415,10 @@ class EnergyBalance:
 
     @property
     def _work_from_outside(self) -> dict[str, Array]:
-        """Work of operators, environments and stops, by source."""
+        """Work of operators, environments and stops, by source, shape (T,) each, in J.
+
+        Other work, such as that of gravity, is internal to the arms.
+        """
         sources = {}
         for name in EXTERNAL_SOURCES:
             if name in self.work:

@@ -658,13 +658,17 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
 
 
 def _jump_alone(amount: Array) -> Increment:
-    """Returns amounts of energy that all belong to the jumps at the ends of periods."""
+    """Returns an energy that changes only by jumps, when a new sample comes into use.
+
+    Args:
+        amount: The jump at the end of each period, shape (K - 1,), in J.
+    """
     zero = np.zeros(len(amount))
     return Increment(zero, zero, amount)
 
 
 def _zero_increment(site: SiteMotion) -> Increment:
-    """Returns no energy in every period."""
+    """Returns an energy of zero in every period, for terms that a site does not have."""
     periods = len(site.records.known) - 1
     return _jump_alone(np.zeros(periods))
 

@@ -496,7 +496,11 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
 
 
 def _largest_residual_j(site_books: _SiteBooks) -> float:
-    """Returns the largest error in the books of a law, in J."""
+    """Returns the largest error over time in the energies that a law declares, in J.
+
+    The error is the difference between the energy that the law dissipated and the sum of its
+    other energies.
+    """
     return float(np.abs(site_books.residual).max())
 
 

@@ -164,7 +164,7 @@ class RecordWindow:
         return bool(find_unlimited_rows(self._limits, qd_des))
 
     def _shift_to(self, first: int) -> None:
-        """Drops the records before tick `first`, and moves the others to the front."""
+        """Makes room for newer records: drops those before tick `first`, and moves the rest."""
         remaining = max(0, self.newest + 1 - first)
         dropped = first - self.first
         for rows in (self._floats, self._used, self._known, self._follows, self._rests):

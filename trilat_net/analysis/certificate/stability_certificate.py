@@ -231,7 +231,11 @@ class Certificate(Result):
 
     @property
     def _doubts(self) -> tuple[str, ...]:
-        """Sentences on V, declared energies and the log that contradict a stable run."""
+        """Sentences on findings that contradict a stable run.
+
+        They are about V that rose, declared energies that are wrong or negative, and the log.
+        Empty if there are none.
+        """
         doubts = []
         if self.verdict.finding is StabilityFinding.BROKEN:
             doubts.append(self.verdict.text)
@@ -476,7 +480,10 @@ def _judge_site_balances(
 
 
 def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerdict | None:
-    """Returns a verdict if recorded torques differ from the control law, Eq. (13)."""
+    """Returns the verdict BROKEN if recorded torques differ from the control law, Eq. (13).
+
+    The records are then false, so that nothing can be concluded from them. None if all agree.
+    """
     for site, energy in run.energies.items():
         records = energy.motion.records
         error_nm = energy_terms.measure_torque_error(energy.motion)

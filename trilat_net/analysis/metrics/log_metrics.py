@@ -457,7 +457,11 @@ def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> _Jso
 
 
 def _name_axis(metrics: LogMetrics, entry: _JsonEntry) -> _JsonEntry:
-    """Returns an entry of a joint, renamed to that of an axis, with the units of this axis."""
+    """Converts the entry of a joint to that of an axis, for arms that follow end effectors.
+
+    The key "joint" becomes "axis". Keys that end in a unit of torque or angle get the unit
+    along the axis, for example "force_nm" becomes "force_n".
+    """
     number = entry.pop("joint")
     renamed = {"axis": metrics.label(number)}
     for key, value in entry.items():
@@ -485,7 +489,7 @@ def _response_to_json(response: FrequencyResponse, unit: str) -> _JsonEntry:
 
 
 def _value_and_reason(key: str, value: Metric) -> _JsonEntry:
-    """Returns the number of a metric under a key, and the reason if the number is missing."""
+    """Returns a metric as two JSON keys: its number, and "why", the reason if it is missing."""
     return {key: value.value, "why": value.why or None}
 
 

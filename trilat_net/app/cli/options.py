@@ -527,10 +527,10 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """The options by which a process takes part in a session as one of its members.
+    """The options with which a process takes part in a session as one of its members.
 
-    The members of a session are its sites and recorders. A connection listens at some endpoints
-    and connects to others.
+    The members of a session are its sites and recorders. The options say at which endpoints the
+    process listens, to which it connects, and with which keys.
     """
 
     listen: ListenOption = None
@@ -596,9 +596,10 @@ class MemberOptions(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """Command line options with which a command connects to a running session from outside.
+    """The options with which a command connects to a running session from outside.
 
-    The command only observes or changes the session. It is not one of its sites or recorders.
+    The command only observes or changes the session. It is not one of its sites or recorders,
+    and therefore does not listen for connections.
     """
 
     connect: ConnectOption = None

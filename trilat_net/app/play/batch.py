@@ -83,7 +83,11 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
 
 
 def _limit_by_later(values: Ints) -> Ints:
-    """Returns for each value the smallest of it and all later values, shape (K,)."""
+    """Returns for each value the smallest of it and all later values, shape (K,).
+
+    For example, the values 1, 5, 3, 4 give 1, 3, 3, 4. A message must not be played after one
+    with a higher number, even if its time is later.
+    """
     return np.minimum.accumulate(values[::-1])[::-1]
 
 

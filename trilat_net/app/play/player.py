@@ -209,7 +209,7 @@ Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """Progress of a playback.
+    """How far the playing of a log has come, for the line that the user sees.
 
     Attributes:
         position_ns: Time of the next message, in ns after the start of the recorded session.
@@ -278,7 +278,7 @@ class Player:
         self._first_batch: MessageBatch | None = None
 
     def prepare(self) -> int | None:
-        """Waits for the first messages.
+        """Waits for the first messages, so that playing can begin without delay.
 
         Returns:
             The time of the first message, in ns after the start of the recorded session. None

@@ -400,10 +400,11 @@ class _CdrReader:
     def count(self) -> int:
         """Decodes the number of entries of a list, which precedes the entries in the message.
 
-        Each entry must have at least one byte.
+        Each entry has at least one byte. A number above the remaining bytes is therefore wrong,
+        and is refused before memory is reserved for the entries.
 
         Raises:
-            ValueError: Fewer bytes than entries remain. The number must therefore be wrong.
+            ValueError: Fewer bytes than entries remain.
         """
         (count,) = self.numbers("I")
         # A wrong length would let the caller reserve memory for entries that do not exist.

@@ -55,10 +55,10 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """Base of all operators and environments, which exert forces on an arm.
+    """Base of all operators and environments, which exert torques or forces on an arm.
 
-    An operator is a person or program that moves the arm. An environment is a wall or another
-    body that the arm touches.
+    A subclass describes one kind by its keys in a scenario, and converts them to a record for
+    the compiled simulation. A file of this folder with such a class adds a kind.
     """
 
     group: ClassVar[str] = "hands"

@@ -192,10 +192,10 @@ class HandSite(NamedTuple):
         )
 
     def make_hand(self) -> OwnHand:
-        """Creates the schedule of the program that operates the arm.
+        """Creates the object that calls the program and applies its actions at the right ticks.
 
-        The schedule decides in which control periods the program is called, and in which
-        periods its actions take effect after their delay.
+        The program is called `rate_hz` times a second. An action takes effect `delay_s` after
+        the observation on which it rests, rounded up to a whole tick.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
