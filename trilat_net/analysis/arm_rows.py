@@ -662,7 +662,7 @@ class ChainArmRows(NamedTuple):
 
     @property
     def _rows(self) -> RowArray:
-        """The joints in the form that the functions of the kernel expect."""
+        """The joints as the rows that the functions of the simulation kernel read."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:

@@ -186,7 +186,7 @@ class ProcessStarter:
             )
 
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
-        """Requests the start of a command as a child process.
+        """Requests the start of a command of `trilat` as a child process.
 
         Args:
             name: Name of the process, which no other process of the session has.

@@ -150,7 +150,7 @@ def _describe_hold(hand: HandInForce | None) -> str:
 
 
 def describe_angles(q: Sequence[float]) -> str:
-    """Formats the joint angles of an arm for the display.
+    """Formats the joint angles of an arm, so that many joints fit into a column of the table.
 
     Args:
         q: Joint angles in rad.
@@ -242,7 +242,7 @@ class SessionDisplay:
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line that stays in the terminal, above the table of the sites.
+        """Prints a line, such as an event, that stays in the terminal above the table of sites.
 
         Args:
             text: The line.

@@ -336,7 +336,7 @@ class Account:
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def describe(self, *before: "Account") -> str:
-        """Describes the account of a channel in one line, in the form that a log stores.
+        """Describes the account of a channel in one line, as a log stores it for each channel.
 
         The line contains the numbers of expected, received and missing messages, and the first
         ranges of missing numbers.
@@ -371,6 +371,8 @@ class Account:
 
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Formats the first ranges of missing numbers for a message to the user.
+
+        For example ["10-12", "40-40"] if the numbers 10 to 12 and 40 are missing.
 
         Args:
             most: Largest number of ranges to return.

@@ -120,7 +120,7 @@ class Column(NamedTuple):
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of consecutive rows as plain Python values.
+        """Returns the values of consecutive rows as plain Python values, for files such as CSV.
 
         Args:
             first: Index of the first row.

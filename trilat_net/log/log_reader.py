@@ -213,7 +213,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return rows
 
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
-        """Returns a table of the log as a pandas data frame.
+        """Returns a table of the log as a pandas data frame, for example the records of a site.
 
         Args:
             name: Name of the table, see `table`. If it is empty, the frame has a row per site.
@@ -758,7 +758,7 @@ class Log(Result, Mapping[str, SiteLog]):
             site: Name of the site.
 
         Returns:
-            For each tick with changes, the changes in the form that `Site.step` receives.
+            For each tick with changes, the changes as `Site.step` receives them.
 
         Raises:
             LogError: A text is not a valid change of the scenario.
@@ -891,7 +891,9 @@ class Log(Result, Mapping[str, SiteLog]):
         yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
-        """Returns a table of the log as a polars data frame. `to_frame` returns a pandas frame.
+        """Returns a table of the log as a polars data frame.
+
+        `to_frame` returns a pandas data frame.
 
         Args:
             name: Name of a site, or "events".

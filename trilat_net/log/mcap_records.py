@@ -137,6 +137,9 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
 def unpack_chunk(content: bytes) -> bytes:
     """Unpacks the compressed records of a chunk, and checks them against its head.
 
+    The head may lie. Therefore no more is unpacked than its stated size, within reasonable
+    limits.
+
     Args:
         content: Content of the chunk: its head and the compressed records.
 
@@ -545,7 +548,7 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 checksum of a part of the file.
+        """Computes the CRC-32 checksum of a part of the file, to compare it with a stored one.
 
         Args:
             begin: Offset of the first byte of the part.

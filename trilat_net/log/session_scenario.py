@@ -69,7 +69,7 @@ class SessionScenario(Protocol):
         """
 
     def layout(self, site: str) -> Layout:
-        """Returns the lengths of the vectors in the records of a site.
+        """Returns the lengths of the vectors in a site's records, such as its number of joints.
 
         Args:
             site: Name of the site.

@@ -64,6 +64,8 @@ _BALANCE_NOTE = (
 def render_certificate(log: Log, certificate: Certificate) -> Markup:
     """Renders the section about stability: the reasons, and folded tables and figures.
 
+    The judgement itself stands at the beginning of the page.
+
     Args:
         log: Log of the run.
         certificate: Judgement whether the run was stable, with its reasons.

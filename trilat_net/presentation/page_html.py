@@ -34,7 +34,7 @@ def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Ma
 
 
 def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Markup:
-    """Renders content that the reader can unfold.
+    """Renders content that the reader can unfold, so that the page stays short at first.
 
     Args:
         summary: Line that is always visible, as plain text.

@@ -158,6 +158,8 @@ def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
 def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
     """Returns a sentence for each slave whose dominance factors never change.
 
+    The other slaves have bars, see `render_lead_bars`.
+
     Args:
         log: Log of the run.
         leads: Who leads each slave, from `trace_leads`.

@@ -178,7 +178,7 @@ class TextTable(NamedTuple):
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Formats a number as a cell of a table.
+    """Formats a number as a cell of a table. A dash stands for None.
 
     Args:
         value: The number, or None.

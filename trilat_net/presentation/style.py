@@ -154,7 +154,7 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
 
 
 def site_colour(log: Log, site: str) -> str:
-    """Returns the colour of a site, which is the same in every figure.
+    """Returns the colour of a site, which is the same in every figure of the log.
 
     Args:
         log: Log with the site.
@@ -345,6 +345,8 @@ def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> N
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
     """Writes a label beside a row of low panels, in several lines.
+
+    A low panel has no room beside it for a long label in one line.
 
     Args:
         axes: First panel of the row, beside which the label is written.
@@ -549,6 +551,8 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns a figure that contains only the reason why there is nothing to draw.
+
+    A command that writes a figure thus always writes a file.
 
     Args:
         text: The reason.

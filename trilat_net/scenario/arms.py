@@ -261,7 +261,7 @@ class ArmModel(NamedTuple):
         speeds: Largest speed of each joint according to the file, in rad/s or m/s. inf if the
             file does not state it.
         lengths_m: Lengths of the two links of the planar arm. (0, 0) for a chain.
-        chain: Chain in the form that the simulation kernel uses. None for the planar arm.
+        chain: Chain as the record that the simulation kernel reads. None for the planar arm.
     """
 
     theta: Array
@@ -392,6 +392,9 @@ class ArmModel(NamedTuple):
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
         """Returns the range of each joint that its mechanical stops and position limits permit.
 
+        The stops belong to the arm, and the limits to the scenario. The narrower of both
+        counts.
+
         Args:
             limits: Position limits of the site that runs the arm.
         """
@@ -439,7 +442,9 @@ class ArmModel(NamedTuple):
         return (*position.tolist(), *self.end_effector_orientation(q))
 
     def task_jacobian(self, q: Vector) -> Array:
-        """Returns the matrix that converts joint velocities to those of the task coordinates.
+        """Returns the Jacobian J that converts joint velocities to task velocities: xd = J qd.
+
+        Task coordinates are those that sites share if their end effectors follow each other.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -558,7 +563,7 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
 
 
 def _list_planar_bodies(arm: Arm) -> Array:
-    """Returns the planar arm's inertial parameters in the form of a chain, shape (20,).
+    """Returns the planar arm's inertial parameters as those of a chain, shape (20,).
 
     A link has the mass m, its centre of mass at (c, 0, 0), and the moment of inertia I about
     the z axis through the centre of mass. About its joint, the first moment along x is m c, and
@@ -725,7 +730,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Returns a joint in the form that the simulation kernel uses.
+    """Returns a joint as the record that the simulation kernel reads.
 
     A stop is a spring that pushes with the effort limit of the joint at the depth
     `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the stiffness.

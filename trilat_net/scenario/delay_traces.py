@@ -192,7 +192,7 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns a delay trace as a string, in the form in which a scenario contains it.
+    """Returns a delay trace as the string that a scenario contains.
 
     A delay trace is a table of send times and the delay that each message had. The form of the
     text is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the
@@ -248,7 +248,7 @@ def parse_trace(text: str) -> Points:
     cached, because the trace of a link is needed many times.
 
     Args:
-        text: Trace in the form that `format_trace` returns.
+        text: Trace as a string that `format_trace` returned.
 
     Returns:
         Read-only array of times and delays in microseconds, shape (n, 2). A lost message has

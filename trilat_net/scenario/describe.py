@@ -72,7 +72,7 @@ def lacks_detailed_balance(scenario: Scenario) -> bool:
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link in s, in the form of `LawSituation.delay_s`.
+    """Returns the delay of every link in s, as `LawSituation.delay_s` contains it.
 
     A constant delay is rounded up to whole ticks of the receiver. The other delays are NaN.
 
@@ -549,7 +549,7 @@ _MAX_VALUE_LENGTH = 80
 
 
 class ScenarioDifference(NamedTuple):
-    """One key in which several experiments differ.
+    """One key in which several experiments differ, as a row of a comparison.
 
     Attributes:
         key: Dotted path of the key, without `sites.NAME` for a key of a site.

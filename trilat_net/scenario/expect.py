@@ -315,6 +315,9 @@ class Expect(
 def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
     """Returns the reason why no run could satisfy the expectations of a scenario.
 
+    For example, an expected end pose must have as many angles as the arm has joints. The
+    problem is reported when the scenario is loaded, and not after a long run.
+
     Args:
         expect: The expectations.
         joint_counts: Number of joints of each site's arm, by the name of the site.

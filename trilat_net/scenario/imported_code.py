@@ -128,7 +128,7 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission to run the code of a file.
+    """Permission of a person to run the code of one file, which a scenario names.
 
     Attributes:
         file: Path of the file. If None, it is the file that Python's import finds for the
@@ -322,6 +322,8 @@ class _CodeSource(NamedTuple):
 
 def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
     """Reads the file that defines a class, without running any code of it.
+
+    Its hash shows whether a permission applies to it.
 
     Args:
         code: Module and class, for example "package.module:Law".

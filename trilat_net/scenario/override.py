@@ -395,7 +395,9 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
 
 
 def split_assignment(text: str) -> Override | None:
-    """Splits a text KEY=VALUE into its key and its value.
+    """Splits a text KEY=VALUE, as the option --set has it, into its key and its value.
+
+    For example, "links.delay_ms=5" gives the key "links.delay_ms" and the value 5.
 
     Args:
         text: The text. A value that is not valid TOML is a bare word, and is taken as a string.

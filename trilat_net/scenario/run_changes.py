@@ -192,7 +192,7 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
 
 
 def find_requester(sentence: str) -> str:
-    """Extracts from the sentence about a stop who requested it.
+    """Extracts from the sentence about a stop who requested it, for the timeline of a report.
 
     Args:
         sentence: Sentence that `describe_change` returned.

@@ -536,6 +536,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def peers(self, site: str) -> tuple[str, ...]:
         """Returns the names of all other sites, in the order of the scenario.
 
+        Arrays with an entry per peer, such as the ages of samples, have this order. A peer is
+        included even if the site does not follow it.
+
         Args:
             site: Name of the site whose peers are returned.
         """
@@ -637,6 +640,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def channel(self, site: str) -> LawChannel:
         """Returns the layout of the numbers that the control law of a site sends to its peers.
+
+        Most laws send nothing but the state of the arm, and have an empty layout. A law that
+        sends waves, for example, has a vector for them.
 
         Args:
             site: Name of the site.
@@ -786,7 +792,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
-        """Returns the link from a peer to a site in the form of the simulation kernel.
+        """Returns the link from a peer to a site as the record that the kernel reads.
 
         It includes the planned changes of the link.
 
@@ -868,7 +874,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
 
         Returns:
-            The changes in the form of the simulation kernel. Empty if none is planned.
+            The changes as records that the kernel reads. Empty if none is planned.
         """
         return [
             self.ramp(site, change.to, change.start_ns, change.ramp_s)

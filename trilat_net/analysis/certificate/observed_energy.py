@@ -300,7 +300,7 @@ def _read_law_records(
     law: Any,
     count: int,
 ) -> LawRecords:
-    """Returns the records of a site in the form that a law expects.
+    """Returns the records of a site as the object that a law reads to compute its energies.
 
     Args:
         log: The log of the run.

@@ -86,7 +86,7 @@ def flag(names: str, text: str = "", **settings: Any) -> Any:
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Declares a command line option with a time to wait, from 0 s to one day.
+    """Declares a command-line option with a time to wait, from 0 s to one day.
 
     Args:
         name: Name of the option, such as "--timeout".
@@ -178,7 +178,7 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Lists the sites with which a shell may complete a word.
+    """Lists the sites with which a shell may complete a word of the command line.
 
     Args:
         context: The command line, whose scenario or log has the sites.
@@ -427,6 +427,8 @@ AllOption = Annotated[
 def check_picture(path: Path | None, *, force: bool) -> None:
     """Refuses the path of a figure that cannot be written.
 
+    The check is made before the result is computed, which may take long.
+
     Args:
         path: Path of the figure. None if no figure was requested.
         force: True to replace an existing file.
@@ -452,6 +454,9 @@ def print_and_draw(
     result: "Result", picture: Path | None, figure: str, drawn: Any, *, as_json: bool
 ) -> None:
     """Prints a result, and writes a figure of it if a path is given.
+
+    The module that draws is imported only if a figure is requested, because Matplotlib is slow
+    to import.
 
     Args:
         result: The result.

@@ -236,7 +236,7 @@ class BatchBuilder:
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message to those that will be sorted.
+        """Adds a message, in the order of the file, to those that will be sorted for playing.
 
         Args:
             t_ns: Time of the message after the start of the session, in ns.

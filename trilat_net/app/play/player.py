@@ -54,7 +54,7 @@ class Pace:
     rate: float = 1.0
 
     def due_ns(self, t_ns: int) -> int:
-        """Computes the deadline of a message.
+        """Computes the deadline of a message: the time on the player's clock when it is due.
 
         Args:
             t_ns: Time of the message in the log, in ns after the start of the recorded session.

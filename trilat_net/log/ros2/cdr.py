@@ -163,7 +163,7 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Encodes one message.
+        """Encodes one message of the type `sensor_msgs/msg/JointState`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -272,7 +272,7 @@ class RosLogLevel(IntEnum):
 
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
-    """Encodes a line for the log of ROS, `rcl_interfaces/msg/Log`.
+    """Encodes a line for the log of ROS, a message of the type `rcl_interfaces/msg/Log`.
 
     Args:
         stamp_ns: Unix time of the line, in ns, 0 or more.
@@ -436,7 +436,7 @@ class _CdrReader:
 
 
 class RosJoints(NamedTuple):
-    """State of a robot's joints, from a message of the type `sensor_msgs/msg/JointState`.
+    """State of a robot's joints, decoded from a message `sensor_msgs/msg/JointState`.
 
     Attributes:
         stamp_ns: Time of the message on the sender's clock, in ns.

@@ -244,6 +244,8 @@ class RobotModel:
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
         """Computes where the links of the arm are, for given positions of its joints.
 
+        Viewers draw the arm from these poses.
+
         Args:
             q: Positions of the joints, in rad or m.
 

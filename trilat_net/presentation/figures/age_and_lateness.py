@@ -213,6 +213,8 @@ def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
 def compute_cumulative_percent(values: Array, limits: Array) -> Array:
     """Returns the percentage of values that do not exceed each limit.
 
+    The points are the cumulative distribution of the values, for example of ages.
+
     Args:
         values: The values to count, shape (K,).
         limits: The limits, shape (P,).

@@ -67,7 +67,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the actor in the form that the simulation kernel uses."""
+        """Returns the actor as the record from which the kernel computes its torque."""
         raise NotImplementedError
 
     @property

@@ -166,6 +166,8 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 class JointSpring(MovingSpring, frozen=True, tag="spring"):
     """Operator who pulls every joint with a spring and a damper towards a moving pose.
 
+    It is the model of a person who moves an arm to a pose and feels its resistance.
+
     Attributes:
         to_rad: Pose at the end of the motion of the target, in rad.
         from_rad: Pose before the motion, in rad. By default, the start pose of the arm.
@@ -183,6 +185,9 @@ class JointSpring(MovingSpring, frozen=True, tag="spring"):
 
 class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
     """Operator who pulls the end effector with a spring and a damper towards a moving point.
+
+    It is the model of a person who holds the end of an arm. The joints are free to arrange
+    themselves.
 
     Attributes:
         to_m: Point at the end of the motion of the target, in m, one number per axis.

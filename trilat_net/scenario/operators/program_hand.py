@@ -312,7 +312,9 @@ class HandPlayer:
             self.fail(k, describe_exception(error))
 
     def fail(self, k: int, problem: str) -> None:
-        """Makes the program let go of the arm for the rest of the run.
+        """Makes the program let go of the arm for the rest of the run, because it failed.
+
+        The run goes on without it, and the reason is recorded.
 
         Args:
             k: Number of the tick in which it lets go.
@@ -329,7 +331,7 @@ class HandPlayer:
 
 
 def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Finds the program that operates the arm of a site.
+    """Finds the program that operates the arm of a site, if the scenario has one.
 
     Args:
         scenario: Description of the experiment.
