@@ -187,6 +187,8 @@ class AlignedRecords(NamedTuple):
     def known_at_end(self, length_s: float) -> Bools:
         """Marks the rows in the last seconds of the run that are recorded, not interpolated.
 
+        Metrics of the end of a run, such as the last error, use these rows alone.
+
         Args:
             length_s: Length of the interval at the end of the records, in s.
 
@@ -516,6 +518,9 @@ _BEFORE_EPOCH_S = -1.0
 
 def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
     """Returns the motion of a peer as a site receives it, with the delay of the link.
+
+    The records of the site say which sample it used in each tick, and the motion of the peer
+    says what this sample contained.
 
     Args:
         records: Records of the site, which name the sample in use at every tick.

@@ -337,7 +337,8 @@ class PlanarArmRows(NamedTuple):
     def gravity_parameters(self) -> NDArray[np.bool_]:
         """Marks the parameters on which the gravity torque depends, shape (5,).
 
-        The entries are True for theta_4 and theta_5, the products of masses and lever arms.
+        The entries are True for theta_4 and theta_5, the products of masses and lever arms. The
+        other parameters describe inertia alone.
         """
         return np.arange(5) >= 3
 
@@ -361,6 +362,8 @@ class PlanarArmRows(NamedTuple):
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
         """Returns the product M(q) x of the inertia matrix and a vector, in each of K poses.
+
+        With velocities, the products are momenta, and with accelerations they are torques.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -842,7 +845,7 @@ class ChainArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that the joints need to overcome their friction.
+        """Returns the torque that the joints need to overcome their friction, dry and viscous.
 
         Args:
             speed: Joint velocities at K times, shape (K, n) for n joints, in rad/s.
@@ -986,6 +989,9 @@ ArmRows = PlanarArmRows | ChainArmRows
 
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     """Returns the model of a site's arm, for computations over many poses at once.
+
+    Certificate and metrics evaluate inertia and energy at every record, for which one call per
+    record would be too slow.
 
     Args:
         scenario: The description of the experiment, which defines the arm.

@@ -180,6 +180,8 @@ def is_ending_trace(link: LinkBase) -> bool:
 def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     """Returns the delay model of a link that is in force at the end of a scenario.
 
+    The linear analysis of a run belongs to this model, because it concerns the final pose.
+
     Args:
         scenario: Description of the experiment. Its timeline may change the link.
         name: Name of the link, for example "m1->s".

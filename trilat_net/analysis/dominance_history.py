@@ -395,6 +395,8 @@ def evaluate_ramps(
 ) -> DominanceHistory:
     """Computes dominance factors over time from their start values and their changes.
 
+    A change is a ramp: the factors move linearly to their new values, as in the simulation.
+
     Args:
         start: Factors at the start of the session, shape (P,).
         ramps: Changes of the factors.

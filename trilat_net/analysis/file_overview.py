@@ -310,6 +310,9 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     def report_pass(number: int) -> Progress | None:
         """Returns a function that reports the progress of one of two passes over the files.
 
+        `info` reads the files twice. Both passes together are shown as one progress from 0 to
+        1.
+
         Args:
             number: 0 for the first pass, which covers the first half of the progress, 1 for the
                 second.

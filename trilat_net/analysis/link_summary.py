@@ -364,6 +364,8 @@ class ClockSummary(NamedTuple):
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
     """Returns the estimates of a peer's clock that a site made during a session.
 
+    The age of a sample is known only as well as the offset between both clocks.
+
     Args:
         log: The log of the run.
         peer: Name of the peer.

@@ -353,6 +353,9 @@ def reduce_to_buckets(
 def trace_log(log: Log) -> RunTrace:
     """Reduces a log to the data that are needed to judge the end of the run.
 
+    The reduced data of a long log fit into memory, and simulations without a log produce the
+    same.
+
     Args:
         log: The log of the run.
 

@@ -120,6 +120,8 @@ def find_error_of_last_second(part: SiteLog) -> JointError | None:
 def find_last_error(log: Log) -> JointError | None:
     """Finds the largest error |e| of all sites in the last second of their records.
 
+    It shows whether the arms agree at the end of the run.
+
     Args:
         log: Log of the run.
 
@@ -184,7 +186,7 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
-    """Returns the time at which the last site has settled, in s.
+    """Returns the time at which the last site has settled, in s, for a run as a whole.
 
     Args:
         times_s: Settling time of each site, from `settling_time_s`. None for a site that has

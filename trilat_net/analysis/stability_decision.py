@@ -131,7 +131,7 @@ class StabilityDecision(NamedTuple):
 
 
 class RunFindings(NamedTuple):
-    """Everything that is known about the stability of a run.
+    """Everything that is known about the stability of a run: the input of `decide_stability`.
 
     Attributes:
         end: How the motion ends.

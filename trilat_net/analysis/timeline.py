@@ -141,7 +141,9 @@ class _ModeInterval(NamedTuple):
 
 
 class StatedModel(NamedTuple):
-    """A delay model that the scenario, or a change of it, prescribes for a link.
+    """A delay model that the scenario, or a change during the run, prescribes for a link.
+
+    Measured delays are compared with it.
 
     Attributes:
         from_s: Time from which the model applies, in s after the start of the session. It

@@ -40,6 +40,8 @@ SCRIPT_TORQUE_TOLERANCE = 1e-8
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
     """Lists the virtual walls that the end effector of a site may touch, in scenario order.
 
+    A wall is a plane that pushes the end effector back with a spring and a damper.
+
     Args:
         spec: Description of the site.
     """

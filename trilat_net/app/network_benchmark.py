@@ -186,6 +186,8 @@ class NearEnd:
         def count_missing() -> int:
             """Stores the round trip times of messages that have come back meanwhile.
 
+            Replies to messages of earlier measurements are ignored.
+
             Returns:
                 The number of messages of this measurement that have not come back yet.
             """

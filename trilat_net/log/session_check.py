@@ -67,7 +67,7 @@ _ACCOUNTS_SINCE = 3
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """Result of checking the files of one log, as `check_file` returns it.
+    """Result of checking the files of one log, as `trilat log check` prints it.
 
     Attributes:
         files: Names of the files.

@@ -139,6 +139,9 @@ def conclude(
 ) -> Conclusion:
     """Checks the log of a finished run, and writes its page and summary into a folder.
 
+    The checks execute the log again in a second process, while this process judges the run and
+    draws the figures.
+
     Args:
         log: Log that was opened from files.
         folder: Existing folder.

@@ -37,6 +37,8 @@ _MAX_CHANGES = 3
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     """Renders the section with the commands, the scenario, the assumptions and the versions.
 
+    With these, a reader can repeat the run.
+
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.

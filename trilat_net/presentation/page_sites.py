@@ -103,6 +103,8 @@ _LOOP_COLUMNS = {
 def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section with the timing of each site's control loop.
 
+    It shows how punctual the ticks were, and how long they took to compute.
+
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.

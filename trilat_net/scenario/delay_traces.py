@@ -169,6 +169,8 @@ def _is_number(cell: str) -> bool:
 def read_trace(path: Path, link: str) -> str:
     """Reads a delay trace from a CSV file, or from the log of a run.
 
+    A trace of a real network lets a simulation repeat its delays.
+
     Args:
         path: CSV file with the columns `t_s,delay_ms`, or a log.
         link: Name of the link whose delays are taken from a log, for example "m1->s".

@@ -257,7 +257,7 @@ def read_source(source: str | Path) -> tuple[str, Path]:
 
 
 def find_site(scenario: Scenario, name: str) -> SiteSpec:
-    """Looks up a site of a scenario by its name.
+    """Looks up a site of a scenario by its name, with a helpful error for a wrong name.
 
     Args:
         scenario: Description of the experiment.

@@ -478,6 +478,8 @@ def _read_parameter_estimates(
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
     """Reads the parameter estimates of all sites at the start and at the end of a run.
 
+    They show what the adaptive laws learnt about their arms.
+
     Args:
         view: The run.
 

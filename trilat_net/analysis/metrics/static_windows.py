@@ -200,6 +200,9 @@ def _average_window(
 class StiffnessEstimate(NamedTuple):
     """Stiffness that an operator met at a joint, between two successive static windows.
 
+    All arms rest in a static window. The stiffness is the change of torque over the change of
+    angle, for example of an arm that leans against a wall.
+
     Attributes:
         from_s: End of the first window, in s.
         to_s: End of the second window, in s.
@@ -376,6 +379,8 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 def count_static_windows(view: RunView) -> Metric:
     """Counts the times of a run in which all arms rest under constant torques.
+
+    Without such times, stiffness and force sharing cannot be measured.
 
     Args:
         view: The recorded run.

@@ -68,6 +68,8 @@ def find_rightmost_root(
 ) -> CharacteristicRoot | None:
     """Returns the rightmost characteristic root of the loop about an equilibrium.
 
+    Its real part is the growth rate of small motions: the loop is stable if it is negative.
+
     Args:
         conditions: The numbers of the loop.
         rest: The equilibrium.
@@ -165,6 +167,8 @@ class LinearEdge(NamedTuple):
 
 class EdgeScan(NamedTuple):
     """The values of a key, within a range, at which a loop becomes stable or unstable.
+
+    A loop with no edge in the range is stable in the whole range, or unstable.
 
     Attributes:
         key: Key of the scenario, such as "control.d".

@@ -98,7 +98,7 @@ class _EndLoop(NamedTuple):
     programs: tuple[str, ...] = ()
 
     def compute_sampled_roots(self, count: int) -> Spectrum | None:
-        """Computes the rightmost roots of the loop with its ticks.
+        """Computes the rightmost roots of the loop, whose controllers compute once per tick.
 
         Args:
             count: Number of roots.

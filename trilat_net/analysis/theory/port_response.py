@@ -298,6 +298,9 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     """Returns the response at some ports, while no operator acts at the others.
 
+    A port at which no operator acts has the torque zero, so that its rows and columns are left
+    out.
+
     Args:
         response: The response at all ports, as a function of frequency.
         ports: Indices of the ports to keep.

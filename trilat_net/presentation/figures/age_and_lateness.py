@@ -231,6 +231,8 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
 def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
     """Returns the mean delay that the scenario states for a link, as the points of a line.
 
+    The figure draws it dashed beside the measured ages, which should agree with it.
+
     Args:
         log: Log of the run.
         models: Models of the link in order of time, at least one.

@@ -210,7 +210,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
-    """Returns the pose of a site in its last record until a time.
+    """Returns the pose of a site in its last record until a time, for drawing.
 
     Args:
         log: Log of the run.
