@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.truth import Judged, judged, offset_errors
+from tests.truth import Judged, judge_link, offset_errors
 from trilat_net.log.log_reader import open_log
 
 from .sessions import SITES, paper
@@ -23,7 +23,7 @@ def run() -> list[str]:
             process.code(DURATION_S + 60.0)
         log = open_log(session.log)
         links = [(site, peer) for site in SITES for peer in log.scenario.peers(site)]
-        samples = {link: judged(log, *link) for link in links}
+        samples = {link: judge_link(log, *link) for link in links}
         errors = np.concatenate([offset_errors(log, *link) for link in links])
     return [*_delays(list(samples.values())), *_clocks(errors)]
 

@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from device_tests.devices import HaplyService
 
 import trilat_net
 from tests.live.processes import HOLDER, PAPER, Session, Stage, connections
+from tests.sites.devices import HaplyService
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics

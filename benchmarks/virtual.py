@@ -7,7 +7,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
-from trilat_net.log.ros2.viz_channels import VIZ_HZ
+from trilat_net.log.view_rates import VIZ_HZ
 from trilat_net.net import topics
 from trilat_net.net.wire import encode_state
 from trilat_net.scenario import Scenario, load_scenario

@@ -36,8 +36,8 @@ from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, OffsetLimit
 from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
+from trilat_net.own_code.imported_code import ImportedLaw
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.imported_code import ImportedLaw
 from trilat_net.scenario.operators.program_hand import (
     HandPlayer,
     find_own_hand,

@@ -60,7 +60,7 @@ s = {{ m = 1.0 }}
 
 
 def six_joints(duration_s: float, delay_ms: float = 20.0, urdf: str = "arm6.urdf") -> str:
-    """The text of three arms of six joints."""
+    """Returns the text of three arms of six joints."""
     return SIX.format(duration_s=duration_s, delay_ms=delay_ms, urdf=urdf)
 
 
@@ -71,7 +71,7 @@ def two_arms(
     delay_ms: float = 40.0,
     armature: float | list[float] = 0.2,
 ) -> str:
-    """The text of two arms of one file in one pose."""
+    """Returns the text of two arms of one file in one pose."""
     return TWO.format(
         urdf=urdf, q0=list(q0), duration_s=duration_s, delay_ms=delay_ms, armature=armature
     )
@@ -79,7 +79,9 @@ def two_arms(
 
 @functools.cache
 def robot_files() -> dict[str, Path]:
-    """The files of `example-robot-data`, which long tests have, by their path in its folder of robots."""
+    """Returns the files of `example-robot-data`, which long tests have, by their path in its
+    folder of robots.
+    """
     files = [
         str(file)
         for file in metadata.files("example-robot-data") or ()
@@ -91,4 +93,4 @@ def robot_files() -> dict[str, Path]:
         )
         for name in files
     }
-    return {name: Path(str(place)) for name, place in places.items()}
+    return {name: Path(str(path)) for name, path in places.items()}

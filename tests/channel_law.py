@@ -6,7 +6,8 @@ from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Talking:
-    """P+d whose spring pulls towards what peers say; it tells all its energy, and each peer where to go.
+    """P+d whose spring pulls towards the messages of peers; it tells all peers its energy, and
+    each peer a target.
 
     `told` is cumulative, so that a wrong number, once used, stays in every later record.
     """

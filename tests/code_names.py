@@ -83,14 +83,14 @@ def collect_words() -> frozenset[str]:
     Every word of a test counts. The test of these names does not: it holds names that nothing defines.
     """
     program = set(house.files())
-    words = set()
+    all_words = set()
     for path in list_files():
-        words |= {*path.relative_to(house.ROOT).parts, path.stem}
+        all_words |= {*path.relative_to(house.ROOT).parts, path.stem}
         if path in program:
-            words |= set(_iterate_words_of_code(path))
+            all_words |= set(_iterate_words_of_code(path))
         elif path.name != "test_code_names.py" and _has_words(path):
-            words |= set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
-    return frozenset(words)
+            all_words |= set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+    return frozenset(all_words)
 
 
 @cache
@@ -122,16 +122,16 @@ def is_defined(name: str) -> bool:
     A name that begins with a package of the program is resolved in its module. `test_of_` with an ellipsis stands
     for the names that begin so, and a test may be named without `test_`.
     """
-    words = collect_words()
+    known_words = collect_words()
     name = name.removesuffix("()").lstrip(".")
     if name.endswith("..."):
-        return any(word.startswith(name.removesuffix("...")) for word in words)
+        return any(word.startswith(name.removesuffix("...")) for word in known_words)
     package, *rest = name.split(".")
     if len(rest) > 1 and (house.ROOT / "trilat_net" / package).is_dir():
         module, *rest = [
             part for part in rest if not (house.ROOT / "trilat_net" / package / part).is_dir()
         ]
         return set(rest) <= _find_modules().get(module, set())
-    return name in words or all(
-        part in words or f"test_{part}" in words for part in (package, *rest)
+    return name in known_words or all(
+        part in known_words or f"test_{part}" in known_words for part in (package, *rest)
     )

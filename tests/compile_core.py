@@ -66,17 +66,21 @@ def compile_parts(parts: Sequence[str], cores: int) -> None:
             print(f"compiled {done} of {len(parts)}: {one.result()}", flush=True)
 
 
-def main(words: Sequence[str]) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Compiles what is named."""
-    if words[:1] != ["--into"]:
-        parts = words or OF_TESTS
+    if arguments[:1] != ["--into"]:
+        parts = arguments or OF_TESTS
         compile_parts(parts, min(count_cores(), len(parts)))
         return
     with tempfile.TemporaryDirectory() as cache:  # workers see this environment
         os.environ.update(NUMBA_CPU_NAME="generic", XDG_CACHE_HOME=cache)
-        compile_parts(words[2:] or SHIPPED, 1)  # two at once may overwrite what an index says
+        compile_parts(
+            arguments[2:] or SHIPPED, 1
+        )  # two at once may overwrite what an index says
         within = shutil.ignore_patterns("*-within*")
-        shutil.copytree(Path(cache) / "trilat-net", words[1], ignore=within, dirs_exist_ok=True)
+        shutil.copytree(
+            Path(cache) / "trilat-net", arguments[1], ignore=within, dirs_exist_ok=True
+        )
 
 
 if __name__ == "__main__":

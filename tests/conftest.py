@@ -1,4 +1,4 @@
-"""Hypothesis profiles, and the runs that many tests look at."""
+"""Hypothesis profiles, and the runs that many tests share."""
 
 import gc
 from collections.abc import Iterator
@@ -39,14 +39,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(autouse=True)
 def _process_as_it_was() -> Iterator[None]:
-    """A site's settings, as a real-time priority and no collector, are not those of the tests after it."""
+    """Restores the process's settings, such as real-time priority and the collector, which a
+    site changes.
+    """
     yield
     assert gc.isenabled()
 
 
 @pytest.fixture
 def log_file(short_log: bytes, tmp_path: Path) -> Path:
-    """A short log, as long as the folder's tests want it, as a file of the test's own."""
+    """Saves a short log, of the length chosen by the folder's tests, as a file of the test's own."""
     path = tmp_path / "run.mcap"
     path.write_bytes(short_log)
     return path

@@ -1,8 +1,9 @@
 """Deals the tests like cards, one of each module in turn: `pytest -p tests.dealt`.
 
-Workers take tests from each other, so that a worker may leave a module after any test and come back to it. A
-fixture of a module that counts on being the first to import a file, or to write a cache, then fails, but on
-some runs alone. Dealt, every test has the fixtures of its module set up anew, in a process that had them.
+Workers take tests from each other, so that a worker may leave a module after any test and come
+back to it. A fixture of a module that relies on being the first to import a file, or to write a
+cache, then fails, but only in some runs. Dealt tests have the fixtures of their module set up
+again in a process that already had them.
 """
 
 from collections import defaultdict

@@ -41,9 +41,9 @@ class Block(NamedTuple):
 def find_blocks(page: str) -> tuple[Block, ...]:
     """Returns the blocks of a page, in order."""
     blocks = []
-    for found in _BLOCK.finditer((ROOT / page).read_text(encoding="utf-8")):
-        text = found["fenced"] if found["fenced"] is not None else _unindent(found["indented"])
-        stated = found["language"] or ""
+    for match in _BLOCK.finditer((ROOT / page).read_text(encoding="utf-8")):
+        text = match["fenced"] if match["fenced"] is not None else _unindent(match["indented"])
+        stated = match["language"] or ""
         guessed = "sh" if _PROGRAM.match(text) else "python" if _CODE.match(text) else ""
         blocks.append(
             Block(page, guessed if stated == "" else stated.replace("text", ""), text)
@@ -56,23 +56,24 @@ def _unindent(text: str) -> str:
 
 
 def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
-    """Yields the words of every command of a block, and the lines of output that the block shows of it.
+    """Yields the words of every command of a block, and the lines of output that the block
+    shows for it.
 
-    What stands in [--brackets] may be given, and is.
+    Options in [--brackets] are optional, and are given.
     """
     lines = re.sub(r"\[(--[^\]]*)\]", r"\1", text.replace("\\\n", " ")).splitlines()
     shows = any(line.startswith("$ ") for line in lines)
-    made: list[tuple[list[str], list[str]]] = []
+    commands: list[tuple[list[str], list[str]]] = []
     for line in lines:
         if shows and not line.startswith("$ "):
             if line.strip() != "...":
-                made[-1][1].append(" ".join(line.split("   #")[0].split()))
+                commands[-1][1].append(" ".join(line.split("   #")[0].split()))
             continue
         parts = re.split(r"  {2,}(?=[a-z])", line.removeprefix("$ "))[0].split(" && ")
-        made.extend(
+        commands.extend(
             (words, []) for part in parts if (words := shlex.split(part, comments=True))
         )
-    yield from made
+    yield from commands
 
 
 ELSEWHERE = {

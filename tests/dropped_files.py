@@ -1,4 +1,4 @@
-"""What a program sees in a process of its own that is given a folder with a file to be found there."""
+"""The view of a program in its own process on a folder that contains a planted file."""
 
 import json
 import subprocess
@@ -24,8 +24,8 @@ def put_beside(folder: Path, room: str, file: str, text: str) -> None:
         if at.is_symlink():  # of a file put beside others before
             at.unlink()
         at.mkdir(exist_ok=True)
-        for one in of.iterdir():
-            if one.name not in (below, "__pycache__") and not (at / one.name).exists():
-                (at / one.name).symlink_to(one)
+        for source in of.iterdir():
+            if source.name not in (below, "__pycache__") and not (at / source.name).exists():
+                (at / source.name).symlink_to(source)
         at, of = at / below, of / below
     (at / file).write_text(text)

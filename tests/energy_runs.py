@@ -78,18 +78,18 @@ def _name_columns(scenario: Scenario, name: str, rows: Any) -> Any:
 
 def least_energy(run: dict[str, Any]) -> float:
     """The least energy, J, that any end of a line or coupling, or any tank, has observed."""
-    found = [run[site].to_all.H for site in run if hasattr(run[site].to_all, "H")]
-    found += [
+    energies = [run[site].to_all.H for site in run if hasattr(run[site].to_all, "H")]
+    energies += [
         getattr(to, name)
         for site in run.values()
         for to in site.sent
         for name in ("W", "W_led", "W_followed")
         if hasattr(to, name)
     ]
-    return min(float(one.min()) for one in found)
+    return min(float(energy.min()) for energy in energies)
 
 
-def drawn(law: str, seed: int) -> Scenario:
+def draw_energy_run(law: str, seed: int) -> Scenario:
     """Two or three sites, half of the runs with planar arms, over a bad network; shares change thrice.
 
     Half of the samples are lost, or delays are those of 4g, or jitter is as long as the delay. In most runs
@@ -138,7 +138,7 @@ def drawn(law: str, seed: int) -> Scenario:
             for at_s, name in times
         ]
         more["timeline"] = [
-            {**one, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for one in changes
+            {**change, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for change in changes
         ]
         more["dominance"] = {name: _draw_shares(rng, name) for name in names}
     control, link = {"law": law, **keys[law]}, links[rng.integers(4)]

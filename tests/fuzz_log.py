@@ -50,20 +50,20 @@ class Choices:
 
 
 def changed(data: bytes) -> None:
-    """One run: a log, changed as the bytes say, read by all."""
+    """Runs once: a log, changed by the fuzzer's bytes, is read by all readers."""
     choices = Choices(data)
     log = LOGS[choices.randrange(0, len(LOGS))]
     read(mangled(log, choices))
 
 
 def read(data: bytes) -> None:
-    """One run: these bytes, read by all."""
+    """Runs once: the bytes are read by all readers."""
     PATH.write_bytes(data)
     read_by_all(PATH)
 
 
 def main() -> None:
-    """Runs until it is told to end, or until something is found."""
+    """Runs until the fuzzer is stopped, or until a finding."""
     as_bytes = "--bytes" in sys.argv
     arguments = [argument for argument in sys.argv if argument != "--bytes"]
     if as_bytes:

@@ -94,17 +94,17 @@ def room_imports() -> set[tuple[str, str]]:
 
 def definitions(path: Path) -> set[str]:
     """Returns the classes and functions of a file, those of classes as `Class.method`."""
-    found = set()
+    names = set()
     for node in tree(path).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found.add(node.name)
+            names.add(node.name)
         if isinstance(node, ast.ClassDef):
-            found |= {
+            names |= {
                 f"{node.name}.{below.name}"
                 for below in node.body
                 if isinstance(below, ast.FunctionDef)
             }
-    return found
+    return names
 
 
 @cache
@@ -126,26 +126,26 @@ def _dotted(path: Path) -> str:
 @cache
 def heights() -> dict[str, int]:
     """Returns the height of the layer of each module, by its dotted name; some belong to no layer."""
-    found = {}
+    levels = {}
     for path in files():
         parts = _dotted(path).split(".")
         names = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
         layer = next((name for name in names if name in layers()), None)
         if layer is not None:
-            found[".".join(parts)] = layers()[layer]
-    return found
+            levels[".".join(parts)] = layers()[layer]
+    return levels
 
 
 @cache
 def class_heights() -> dict[str, int]:
     """Returns the height of the lowest layer that defines a class, by the name of the class."""
-    found: dict[str, int] = {}
+    levels: dict[str, int] = {}
     for path in files():
         height = heights().get(_dotted(path))
         for node in tree(path).body:
             if isinstance(node, ast.ClassDef) and height is not None:
-                found[node.name] = min(height, found.get(node.name, height))
-    return found
+                levels[node.name] = min(height, levels.get(node.name, height))
+    return levels
 
 
 def strings(path: Path) -> Iterator[str]:
@@ -168,15 +168,15 @@ def names_from_above(path: Path) -> set[str]:
     height = heights().get(_dotted(path))
     if height is None:
         return set()
-    found = set()
+    names = set()
     for text in strings(path):
         for name in re.findall(r"\w*(?:\.\w+)+", text):
             modules = (name, f"trilat_net.{name.strip('.')}")
             if any(heights().get(module, 0) > height for module in modules):
-                found.add(text)
+                names.add(text)
         if class_heights().get(text, 0) > height:
-            found.add(text)
-    return found
+            names.add(text)
+    return names
 
 
 def unused_methods() -> set[str]:
@@ -212,7 +212,7 @@ def unused_methods() -> set[str]:
                     references.add(name)
                 case ast.Constant(value=str(name)):
                     references.add(name)
-                case ast.ClassDef() if "tests" not in path.parts:
+                case ast.ClassDef() if "tests" not in path.relative_to(ROOT).parts:
                     methods |= {
                         (node.name, method.name)
                         for method in node.body
@@ -223,3 +223,12 @@ def unused_methods() -> set[str]:
         for owner, name in methods
         if name not in references and not name.startswith("__")
     }
+
+
+def list_test_names() -> Iterator[tuple[Path, str]]:
+    """Yields the name of every test of the program and its packages, with the file of the test."""
+    for folder in (ROOT / "tests", *sorted(ROOT.glob("packages/*/tests"))):
+        for path in sorted(folder.rglob("test_*.py")):
+            for node in ast.walk(tree(path)):
+                if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                    yield path.relative_to(ROOT), node.name

@@ -16,7 +16,7 @@ VENV = ROOT / ".venv"
 
 
 def list_extras() -> dict[str, list[str]]:
-    """The extras that bring packages, by name."""
+    """Returns the extras that bring packages, by name."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return {name: needs for name, needs in project["optional-dependencies"].items() if needs}
 

@@ -24,9 +24,9 @@ def read_keys(command: str) -> list[str]:
 
 def is_documented(command: str, value: Any) -> bool:
     """True if the table has every key of a result, as it is, or with more below it."""
-    known = read_keys(command)
+    keys = read_keys(command)
     return all(
-        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in known)
+        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in keys)
         for path in gather([value])
     )
 
@@ -45,10 +45,10 @@ def outline(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
         yield path, _KINDS.get(type(value), "table" if isinstance(value, dict) else "list")
 
 
-def gather(found: list[Any]) -> dict[str, str]:
+def gather(values: list[Any]) -> dict[str, str]:
     """Returns the types of all keys of several samples."""
     kinds: dict[str, set[str]] = {}
-    for one in found:
+    for one in values:
         for path, kind in outline(one):
             kinds.setdefault(path.removeprefix("."), set()).add(kind)
     return {path: " or ".join(sorted(kinds[path])) for path in sorted(kinds)}

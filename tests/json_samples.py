@@ -7,14 +7,13 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from experiment_tests.experiments import (
+import trilat_net as tn
+from tests.experiments import (
     REACH,
     answer_form,
     write_hurried_pair,
     write_protocol,
 )
-
-import trilat_net as tn
 from tests.json_outline import TABLE, gather
 from tests.sites.visits import ping_publishers, ping_sites
 from trilat_net.results import Result

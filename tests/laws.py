@@ -1,4 +1,4 @@
-"""Laws from outside, for tests: the paper's once more, in Python, and some that fail."""
+"""Laws from outside, for tests: the paper's law in Python, and some that fail."""
 
 import math
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class Adaptive:
 
 
 class Failing(Adaptive):
-    """Does something wrong at a tick."""
+    """A law that fails at a tick."""
 
     def __init__(self, facts: LawContext, how: str = "nan", at: int = 3) -> None:
         super().__init__(facts)
@@ -63,7 +63,7 @@ class Failing(Adaptive):
 
 
 class Forgetful(Adaptive):
-    """Does not say all that it remembers."""
+    """A law that does not declare all of its memory."""
 
     def memory(self) -> Sequence[float]:
         return [*self._Yr]
@@ -89,7 +89,7 @@ class Knowing(Adaptive):
 
 
 class NoLaw:
-    """Has nothing that a law has."""
+    """A class that lacks the methods of a law."""
 
 
 def no_class(_facts: LawContext) -> NoLaw:

@@ -32,7 +32,7 @@ PARTS = {
     "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|hooks|records|recorded_change)\.py",
     "analysis": r"^trilat_net/analysis/",
     "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__|entry_points|extension|package_names)\.py",
-    "session": r"^trilat_net/(scenario|net|log|execution)/|^sites/|^recorder/",
+    "session": r"^trilat_net/(scenario|own_code|net|log|execution)/|^sites/|^recorder/",
 }
 """The files of each part by their paths; the first pattern that matches decides."""
 
@@ -74,7 +74,7 @@ class LineFigures:
 def list_sources() -> list[Path]:
     """Returns the source files of the program, in order, without the tests of its packages."""
     paths = (path for top in SOURCES for path in (house.ROOT / top).rglob("*.py"))
-    return sorted(path for path in paths if "tests" not in path.parts)
+    return sorted(path for path in paths if "tests" not in path.relative_to(house.ROOT).parts)
 
 
 def find_part(path: Path) -> str:

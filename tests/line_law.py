@@ -1,4 +1,6 @@
-"""A lossless line between sites, for tests of the energies that a law declares; one variant makes energy."""
+"""A lossless line between sites, for tests of the energies that a law declares; one variant
+makes energy.
+"""
 
 from typing import ClassVar
 
@@ -9,9 +11,11 @@ from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Line:
-    """Wave variables between every two sites (Anderson and Spong 1989): F = b qd - c v, u = c qd - v.
+    """Wave variables between every two sites (Anderson and Spong 1989): F = b qd - c v, u = c
+    qd - v.
 
-    With `boost` the waves are larger than the line says by that factor, which nobody pays for.
+    With `boost` the waves are larger than declared by that factor, so that the line makes
+    energy.
     """
 
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
@@ -43,7 +47,7 @@ class Line:
 
 
 class Silent(Line):
-    """The same, which declares no energies."""
+    """The same line without declared energies."""
 
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
     energies = None

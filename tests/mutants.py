@@ -1,14 +1,15 @@
-"""Single-token changes of the rooms in which an error costs most, each judged by the tests of a push.
+"""Single-token changes of the rooms in which an error costs most, each judged by the tests of a
+push.
 
     python -m tests.mutants --seed 1 --count 40
 
-Changes are drawn by the seed, the same number from each room. Each is made in a copy of the tree, and the
-tests of a push run there, those nearest to the changed file first, until one fails; a changed core takes
-minutes to compile, so its own tests are tried without first. What survives them all is a law that no test
-states, or a change that means nothing.
+Changes are drawn by the seed, equally many from each room. Each change is made in a copy of the
+tree. The tests of a push run there, those nearest to the changed file first, until one fails. A
+changed core takes minutes to compile, so that its own tests run first without compilation. A
+change that survives all tests reveals a law that no test states, or has no effect.
 
-By rule these are not drawn, as no run can tell them: annotations and decorators, text for people (strings,
-and whatever a `raise` says), names that a module exports, and the bases of a class.
+Changes without effect on any run are not drawn: annotations and decorators, text for people
+(strings, and the arguments of `raise`), names that a module exports, and the bases of a class.
 """
 
 import argparse
@@ -125,9 +126,12 @@ class _Places(ast.NodeVisitor):
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
         lines = text.splitlines()
         self._tokens = [
-            ((one.start[0], len(lines[one.start[0] - 1][: one.start[1]].encode())), one.string)
-            for one in tokens
-            if one.string.strip() and one.type != tokenize.COMMENT
+            (
+                (token.start[0], len(lines[token.start[0] - 1][: token.start[1]].encode())),
+                token.string,
+            )
+            for token in tokens
+            if token.string.strip() and token.type != tokenize.COMMENT
         ]
         self._words = dict(self._tokens)
         self.visit(house.tree(path))
@@ -143,10 +147,12 @@ class _Places(ast.NodeVisitor):
             (before.end_lineno, before.end_col_offset),
             (after.lineno, after.col_offset),
         )
-        low, high = (bisect_left(self._tokens, (place, "")) for place in (first, last))
-        words = [one for one in self._tokens[low:high] if one[1] not in ("(", ")")]
-        if len(words) == 1 and words[0][1] in OTHERS:  # `is not` and `not in` are two
-            self._add(*words[0], OTHERS[words[0][1]])
+        low, high = (
+            bisect_left(self._tokens, (token_index, "")) for token_index in (first, last)
+        )
+        tokens = [token for token in self._tokens[low:high] if token[1] not in ("(", ")")]
+        if len(tokens) == 1 and tokens[0][1] in OTHERS:  # `is not` and `not in` are two
+            self._add(*tokens[0], OTHERS[tokens[0][1]])
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         self._between(node.left, node.right)
@@ -196,7 +202,9 @@ class _Places(ast.NodeVisitor):
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         outer, given = self._parameters, node.args
-        names = [one.arg for one in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+        names = [
+            argument.arg for argument in (*given.posonlyargs, *given.args, *given.kwonlyargs)
+        ]
         for default in (*given.defaults, *filter(None, given.kw_defaults)):
             self.visit(default)
         self._parameters = [name for name in names if name not in ("self", "cls")]
@@ -221,7 +229,7 @@ class _Places(ast.NodeVisitor):
 @cache
 def find_mutants(room: str) -> list[Mutant]:
     """Returns all changes that may be drawn of a room."""
-    return [one for path in ROOMS[room] for one in _Places(path).found]
+    return [mutant for path in ROOMS[room] for mutant in _Places(path).found]
 
 
 def draw_mutants(seed: int, count: int) -> list[Mutant]:
@@ -229,9 +237,9 @@ def draw_mutants(seed: int, count: int) -> list[Mutant]:
     rng = random.Random(seed)
     shares = [count // len(ROOMS) + (n < count % len(ROOMS)) for n in range(len(ROOMS))]
     return [
-        one
+        mutant
         for room, share in zip(ROOMS, shares, strict=True)
-        for one in rng.sample(find_mutants(room), share)
+        for mutant in rng.sample(find_mutants(room), share)
     ]
 
 
@@ -273,19 +281,19 @@ def ask_pytest(
 @cache
 def find_paper() -> dict[str, str]:
     """Returns the digests of the tree as it is."""
-    with tempfile.TemporaryDirectory() as made:
-        copy_tree(Path(made) / "tree")
-        return digest_paper(Path(made) / "tree")
+    with tempfile.TemporaryDirectory() as tree_copy:
+        copy_tree(Path(tree_copy) / "tree")
+        return digest_paper(Path(tree_copy) / "tree")
 
 
 @cache
 def find_quick_tests(workers: int) -> list[str]:
     """Returns the tests of the core that pass, and soon, where nothing is compiled."""
-    with tempfile.TemporaryDirectory() as made:
-        copy_tree(Path(made))
+    with tempfile.TemporaryDirectory() as tree_copy:
+        copy_tree(Path(tree_copy))
         options = [f"--timeout={QUICK_S}", "--timeout-method=signal", "-rp", "tests/core"]
-        told = ask_pytest(Path(made), options, workers, **INTERPRETED).stdout
-    return re.findall(r"^PASSED (.+)$", told, re.MULTILINE)
+        output = ask_pytest(Path(tree_copy), options, workers, **INTERPRETED).stdout
+    return re.findall(r"^PASSED (.+)$", output, re.MULTILINE)
 
 
 def digest_paper(tree: Path) -> dict[str, str]:
@@ -294,10 +302,24 @@ def digest_paper(tree: Path) -> dict[str, str]:
     If they differ from those of the tree as it is, so do those of the whole run, see `tests.golden`.
     """
     path = tree.parent / "paper.mcap"
-    words = ["-m", "trilat_net", "sim", "paper", "--duration", "1", "-o", str(path), "--force"]
+    arguments = [
+        "-m",
+        "trilat_net",
+        "sim",
+        "paper",
+        "--duration",
+        "1",
+        "-o",
+        str(path),
+        "--force",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(tree), **INTERPRETED}
     ended = subprocess.run(
-        [sys.executable, *words], cwd=tree, env=environment, capture_output=True, check=False
+        [sys.executable, *arguments],
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        check=False,
     )
     return channel_digests(path) if ended.returncode == 0 else {}
 
@@ -354,8 +376,8 @@ def copy_tree(to: Path) -> None:
 
 def judge_mutant(mutant: Mutant, workers: int) -> str:
     """Returns the name of a test that fails with a change, or "" if it survives."""
-    with tempfile.TemporaryDirectory() as made:
-        tree = Path(made) / "tree"
+    with tempfile.TemporaryDirectory() as tree_copy:
+        tree = Path(tree_copy) / "tree"
         copy_tree(tree)
         (tree / mutant.path.relative_to(house.ROOT)).write_text(
             mutant.apply(), encoding="utf-8"
@@ -379,18 +401,20 @@ def main() -> int:
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, help="processes that test"
     )
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     print("| change | found by | s |\n|---|---|---|", flush=True)
     drawn = [
-        one for one in draw_mutants(given.seed, given.count) if re.search(given.only, str(one))
+        candidate
+        for candidate in draw_mutants(arguments.seed, arguments.count)
+        if re.search(arguments.only, str(candidate))
     ]
     survivors = 0
     for mutant in drawn:
         begun_s = time.monotonic()
-        found = judge_mutant(mutant, given.workers)
-        survivors += not found
+        failure = judge_mutant(mutant, arguments.workers)
+        survivors += not failure
         print(
-            f"| {mutant} | {found or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |",
+            f"| {mutant} | {failure or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |",
             flush=True,
         )
     print(f"\n{len(drawn) - survivors} of {len(drawn)} are found")

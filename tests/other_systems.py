@@ -1,8 +1,8 @@
-"""A process of this system in which the program finds what Windows, macOS and Linux all have, and no more.
+"""A process of this system that hides from the program all that Windows, macOS or Linux lacks.
 
-What each has says typeshed, which comes with mypy. Only the modules of the program are kept from the rest:
-Python's library and other packages have forms of their own for every system. The process says of itself that
-it is one of Windows; the functions of Windows it has not.
+The names of each system come from typeshed, which is a part of mypy. Only the modules of the
+program are restricted, because Python's library and other packages have separate code for every
+system. The process reports to be one of Windows, and lacks the functions that only Windows has.
 """
 
 import ast
@@ -70,7 +70,7 @@ def _list_names(body: list[ast.stmt], platform: str) -> Iterator[tuple[str, bool
             yield node.name, True
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            yield from ((one.id, True) for one in targets if isinstance(one, ast.Name))
+            yield from ((target.id, True) for target in targets if isinstance(target, ast.Name))
         elif isinstance(node, ast.ImportFrom):
             yield from ((alias.asname or alias.name, False) for alias in node.names)
 
@@ -84,14 +84,19 @@ def read_typeshed() -> tuple[dict[str, list[str]], list[str]]:
     stubs, lacks, refused = Path(spec.origin).parent / "typeshed" / "stdlib", {}, []
     for file in stubs.rglob("*.pyi"):
         body = ast.parse(file.read_text(encoding="utf-8")).body
-        here, *there = (set(_list_names(body, platform)) for platform in ("linux", *OTHERS))
-        if missing := {name for name, _ in here.difference(set.intersection(*there))}:
+        linux_names, *other_names = (
+            set(_list_names(body, platform)) for platform in ("linux", *OTHERS)
+        )
+        if missing := {
+            name for name, _ in linux_names.difference(set.intersection(*other_names))
+        }:
             module = ".".join(file.relative_to(stubs).with_suffix("").parts).removesuffix(
                 ".__init__"
             )
             lacks[module] = sorted(missing)
             if not all(
-                any(own and not name.startswith("_") for name, own in names) for names in there
+                any(is_own and not name.startswith("_") for name, is_own in names)
+                for names in other_names
             ):
                 refused.append(module)
     return lacks, refused

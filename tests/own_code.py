@@ -1,4 +1,4 @@
-"""Hands and plants of users' own, as scenarios name them: `tests.own_code:Circle`."""
+"""Users' own hands and plants, as scenarios name them: `tests.own_code:Circle`."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from trilat_net.scenario.simulated_arm import SimulatedArm
 
 
 class Circle:
-    """Moves the end effector along a circle, which it leaves its start on slowly."""
+    """Moves the end effector along a circle, which starts slowly."""
 
     def __init__(self, facts: HandContext, radius_m: float = 0.1, turn_s: float = 1.5) -> None:
         self.radius_m, self.turn_s, self.facts = radius_m, turn_s, facts
@@ -32,7 +32,7 @@ class Circle:
 
 
 class Follower:
-    """Goes where its peers are, as far as their samples tell: what it does depends on all that it sees."""
+    """Moves towards its peers' samples, so that the result depends on every input."""
 
     def __init__(self, facts: HandContext) -> None:
         self.seen: list[HandView] = []
@@ -49,7 +49,7 @@ class Follower:
 
 
 class Failing(Circle):
-    """Fails at a time, in a way."""
+    """Fails at a time, in a given way."""
 
     def __init__(self, facts: HandContext, how: str = "raise", at_s: float = 0.3) -> None:
         super().__init__(facts)
@@ -103,7 +103,7 @@ class Carousel(Arm):
 
 
 class Torn(Arm):
-    """A plant that fails at its 200th step, in a way."""
+    """A plant that fails at its 200th step, in a given way."""
 
     def __init__(self, facts: PlantContext, how: str = "raise") -> None:
         super().__init__(facts)
@@ -130,7 +130,7 @@ MOTOR_S, PARTS = 0.005, 5
 
 
 class HeldArm:
-    """The planar arm without gravity, held by a hand that also does things by itself."""
+    """The planar arm without gravity, held by a hand that also moves on its own."""
 
     def __init__(
         self,
@@ -142,14 +142,14 @@ class HeldArm:
     ) -> None:
         arm = facts.scenario.arms[facts.site]
         self.theta, self.lengths = arm.theta.tolist(), arm.lengths_m
-        self.M, self.B, self.K = (np.reshape(one, (2, 2)) for one in (M, B, K))
+        self.M, self.B, self.K = (np.reshape(matrix, (2, 2)) for matrix in (M, B, K))
         self.q, self.qd = np.array(facts.q0_rad), np.zeros(2)
         self.at = self.look()[0]
         self.unrest_n, self.own, self.tau = unrest_n, np.zeros(2), np.zeros(2)
         self.random = np.random.default_rng(facts.seed)
 
     def look(self) -> tuple[Any, Any, Any]:
-        """Where the end effector is, its Jacobian, and the Jacobian's derivative."""
+        """Returns the position of the end effector, its Jacobian, and the Jacobian's derivative."""
         (l1, l2), (q1, q12), (w1, w12) = self.lengths, np.cumsum(self.q), np.cumsum(self.qd)
         s1, c1, s2, c2 = l1 * np.sin(q1), l1 * np.cos(q1), l2 * np.sin(q12), l2 * np.cos(q12)
         J = np.array([[-s1 - s2, -s2], [c1 + c2, c2]])
@@ -157,7 +157,7 @@ class HeldArm:
         return np.array([c1 + c2, s1 + s2]), J, Jd
 
     def move(self) -> tuple[Any, Any]:
-        """The acceleration, and the hand's torque ON the arm, in the present state."""
+        """Returns the acceleration, and the hand's torque ON the arm, in the present state."""
         at, J, Jd = self.look()
         bend, swing = self.theta[1] * math.cos(self.q[1]), -self.theta[1] * math.sin(self.q[1])
         inner = self.theta[2] + bend
@@ -186,4 +186,4 @@ class HeldArm:
 
 
 class NoHand:
-    """Has no act."""
+    """A class without `act`."""

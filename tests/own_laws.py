@@ -1,4 +1,4 @@
-"""Laws of one's own that say once more what built-in ones do, and a few that go beyond them."""
+"""Users' own laws that repeat built-in ones, and a few that go beyond them."""
 
 import trilat_net
 from trilat_net.core.plug.user_law import LawContext, LawInput
@@ -27,7 +27,7 @@ class CompiledPD(PD):
 
 
 class PeerPD(PD):
-    """`p_d`, by what each peer sent."""
+    """`p_d`, by the sample of each peer."""
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -37,7 +37,7 @@ class PeerPD(PD):
 
 
 class Backward(PD):
-    """P+d with the velocity of the angle that it saw a tick ago."""
+    """P+d with the velocity from the angle of the last tick."""
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -46,7 +46,7 @@ class Backward(PD):
 
 
 class Remembering(Backward):
-    """The same, and it remembers that angle itself."""
+    """The same law, which keeps that angle itself."""
 
     remembers = ("last",)
 
@@ -63,7 +63,7 @@ class Remembering(Backward):
 
 
 class Forces:
-    """`four_channel`: positions, forces of the peers by the sum or each by itself, and its own."""
+    """`four_channel`: positions, forces of the peers as a sum or separately, and the own force."""
 
     remembers = ()
 

@@ -1,4 +1,6 @@
-"""Laws that look at peers and send to all and to each, plain and compiled; some that Numba does not take."""
+"""Laws that look at peers and send to all and to each, plain and compiled; some are unsuitable
+for Numba.
+"""
 
 from typing import Any, ClassVar
 
@@ -7,7 +9,7 @@ from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Line:
-    """Springs to each peer, an energy that all get, an integral, a count; it uses every input."""
+    """Springs to each peer, an energy sent to all, an integral and a count; the law uses every input."""
 
     sends: ClassVar[Any] = {
         "E": {"unit": "J", "length": 1},
@@ -33,9 +35,9 @@ class Line:
             )
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                apart = now.q[i] - peer.q[i]
-                self.integral[j][i] += now.h_s * apart
-                pull = peer.alpha * (self.K * apart + half(self.integral[j][i]))
+                difference = now.q[i] - peer.q[i]
+                self.integral[j][i] += now.h_s * difference
+                pull = peer.alpha * (self.K * difference + half(self.integral[j][i]))
                 if peer.new:
                     pull += 1e-3 * peer.tick + 0.1 * peer.age_s + 0.01 * peer.tau_x[i]
                 now.sent[j].u[i] = pull
@@ -71,7 +73,7 @@ def plain(x: float) -> float:
 
 @compiled
 class Refused:
-    """What Numba does not take, by name."""
+    """Code that Numba refuses, by name."""
 
     remembers = ()
 
@@ -128,7 +130,7 @@ class RemembersText(Refused):
 
 @compiled
 class Forgets(Refused):
-    """Writes no torque at tick 3."""
+    """A law that writes no torque at tick 3."""
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -156,7 +158,7 @@ class Arithmetic:
 
 @compiled
 class ByNumbers(Arithmetic):
-    """The same, number by number."""
+    """The same law, number by number."""
 
     def torque(self, now: LawInput) -> Any:
         for i in range(now.joints):
@@ -167,7 +169,7 @@ class ByNumbers(Arithmetic):
 
 
 class Sums(Arithmetic):
-    """Has memory, and does not say so."""
+    """A law with undeclared memory."""
 
     def torque(self, now: LawInput) -> Any:
         self.sums = now.q

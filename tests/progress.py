@@ -96,7 +96,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class _Hooks:
-    """What the counter hears from pytest."""
+    """The hooks of pytest that feed the counter."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
@@ -127,7 +127,7 @@ class _Hooks:
 
 
 class _HooksOfWorkers:
-    """What the counter hears from the workers of a run in several processes."""
+    """The hooks of pytest that feed the counter in a run of several processes."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress

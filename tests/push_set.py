@@ -45,7 +45,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 def choose_long_tests(times_s: dict[str, float]) -> list[str]:
-    """Returns the tests that a push leaves, of those that took so long."""
+    """Returns the tests that a push leaves to the long run, by their processor times."""
     files: defaultdict[str, list[str]] = defaultdict(list)
     for name in sorted(times_s, key=lambda name: times_s[name]):
         files[name.partition("::")[0]].append(name)
@@ -74,10 +74,10 @@ def main() -> int:
         ).returncode
         rows = [line.partition("\t") for line in times.read_text(encoding="utf-8").splitlines()]
     if code == 0:
-        left = choose_long_tests({name: float(seconds) for seconds, _tab, name in rows})
-        LONG_TESTS.write_text("".join(f"{name}\n" for name in left), encoding="utf-8")
+        long_tests = choose_long_tests({name: float(seconds) for seconds, _tab, name in rows})
+        LONG_TESTS.write_text("".join(f"{name}\n" for name in long_tests), encoding="utf-8")
         print(
-            f"{len(left)} of {len(rows)} tests are left to make test-long: {LONG_TESTS.relative_to(ROOT)}"
+            f"{len(long_tests)} of {len(rows)} tests are left to make test-long: {LONG_TESTS.relative_to(ROOT)}"
         )
     return code
 

@@ -1,23 +1,25 @@
-"""How far a reader walks from `certify` to the judgement, counted in the source: stays and returns.
+"""The walk of a reader from `certify` to the judgement, counted in the source: stays and
+returns.
 
     python -m tests.reading_walk
 
-He begins in `certify` and, as that decides the exit code, in `Certificate.accepts`. He follows the calls of a
-body in the order in which they stand, depth first, into the room `analysis`, and reads
-everything once.
+The reader begins in `certify` and, because it decides the exit code, in `Certificate.accepts`.
+The reader follows the calls of a body in their order, depth first, into the room `analysis`,
+and reads each function once.
 
-- He goes by what measures: a function or property whose annotated result is numbers alone (arrays, floats,
-  whole numbers, what a scenario or a log states, or records and mappings of these with names), for its
-  docstring says what it is, and in which unit. What it calls he follows all the same.
-- He STAYS in every other function, method or property: one that gives a truth value, a word, a sentence, or
-  what holds such.
-- He RETURNS from a stay if the body that brought him there decides on the answer: the call, or a name that
-  was given the answer, stands in a condition (if, while, assert, and, or, filter of a comprehension). From a
-  table of functions (a tuple at the top of a module) he returns once, however many are in it: the first one
-  that applies decides, or all are taken.
+- The reader passes by functions and properties that measure: their annotated results are
+  numbers alone (arrays, floats, whole numbers, statements of a scenario or a log, or records
+  and mappings of these with names), and their docstrings state meaning and unit. The calls of
+  such a function are followed.
+- The reader STAYS in every other function, method or property: its result is a truth value, a
+  word, a sentence, or contains one.
+- The reader RETURNS from a stay if the calling body decides on its result: the call, or a name
+  that holds its result, stands in a condition (if, while, assert, and, or, filter of a
+  comprehension). A table of functions (a tuple at the top of a module) counts as one return,
+  however many functions it holds: the first that applies decides, or all are taken.
 
-Methods and properties are those of the classes that an expression is of, or holds, by the annotations of
-arguments, fields and results. What is of no such class is not followed.
+Methods and properties are those of the classes of an expression or of its elements, by the
+annotations of arguments, fields and results. Expressions of unknown class are not followed.
 """
 
 import ast
@@ -55,7 +57,9 @@ class Place(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """Where a reader stays, in order, and from which of these he returns to decide."""
+    """The functions at which a reader stays, in order, and those from which the reader returns
+    to decide.
+    """
 
     stays: list[Place]
     returns: list[Place]
@@ -63,29 +67,29 @@ class Walk(NamedTuple):
 
 @cache
 def _module_names(path: Path) -> dict[str, Place | Path | ast.expr]:
-    """What the names at the top of a module stand for: definitions, modules, values."""
-    found: dict[str, Place | Path | ast.expr] = {}
+    """Returns the meanings of the names at the top of a module: definitions, modules, values."""
+    names: dict[str, Place | Path | ast.expr] = {}
     for node in house.tree(path).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found[node.name] = Place(path, node.name)
+            names[node.name] = Place(path, node.name)
         elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            found[node.targets[0].id] = node.value
+            names[node.targets[0].id] = node.value
         elif isinstance(node, ast.ImportFrom) and node.level:
             base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
             for alias in node.names:
                 inside = (base / alias.name).with_suffix(".py")
                 module = base.with_suffix(".py")
                 if module.is_file() or inside.is_file():
-                    found[alias.asname or alias.name] = (
+                    names[alias.asname or alias.name] = (
                         Place(module, alias.name) if module.is_file() else inside
                     )
-    return found
+    return names
 
 
 @cache
-def _definition(place: Place) -> ast.FunctionDef | ast.ClassDef | None:
-    head, _, method = place.name.partition(".")
-    body = house.tree(place.module).body
+def _definition(definition: Place) -> ast.FunctionDef | ast.ClassDef | None:
+    head, _, method = definition.name.partition(".")
+    body = house.tree(definition.module).body
     for node in body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == head:
             inside = [
@@ -104,21 +108,21 @@ def _names_in(node: ast.AST) -> Iterator[str]:
 
 
 def _resolve(path: Path, name: str) -> list[Place]:
-    """What a name of a module stands for, through aliases and tables."""
-    found = _module_names(path).get(name)
-    if isinstance(found, ast.expr):
+    """Returns the definitions behind a name of a module, through aliases and tables."""
+    binding = _module_names(path).get(name)
+    if isinstance(binding, ast.expr):
         return [
             place
-            for inner in _names_in(found)
+            for inner in _names_in(binding)
             if inner != name
             for place in _resolve(path, inner)
         ]
-    if not isinstance(found, Place):
+    if not isinstance(binding, Place):
         return []
     return (
-        [found]
-        if _definition(found) or found.module == path
-        else _resolve(found.module, found.name)
+        [binding]
+        if _definition(binding) or binding.module == path
+        else _resolve(binding.module, binding.name)
     )
 
 
@@ -128,7 +132,9 @@ def _fields(node: ast.ClassDef) -> list[ast.AnnAssign]:
 
 @cache
 def _is_numbers(path: Path, name: str) -> bool:
-    """True of a type of numbers: one of `NUMBERS`, or a class all of whose fields are of such."""
+    """True for a type of numbers: one of `NUMBERS`, or a class all of whose fields have such
+    types.
+    """
     places = [] if name in NUMBERS else _resolve(path, name)
     for place in places:
         node = _definition(place)
@@ -145,15 +151,17 @@ def _is_numbers(path: Path, name: str) -> bool:
 
 
 @cache
-def _measures(place: Place) -> bool:
-    """True of what gives numbers alone; names are the keys of a mapping, or the fields of a record."""
-    node = _definition(place)
+def _measures(definition: Place) -> bool:
+    """True for a function that returns numbers alone; names may be keys of a mapping, or fields
+    of a record.
+    """
+    node = _definition(definition)
     if not isinstance(node, ast.FunctionDef) or node.returns is None:
         return True
     names = list(_names_in(node.returns))
     keyed = names[:1] in (["dict"], ["Mapping"])
     texts = "str" in names and not keyed
-    return not texts and all(_is_numbers(place.module, name) for name in names)
+    return not texts and all(_is_numbers(definition.module, name) for name in names)
 
 
 def _conditions(node: ast.AST) -> Iterator[ast.AST]:
@@ -167,7 +175,7 @@ def _conditions(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _decided(function: ast.FunctionDef) -> set[ast.AST]:
-    """The expressions of a body that it decides on."""
+    """Yields the expressions of a body on which the body decides."""
     tested = {inner for test in _conditions(function) for inner in ast.walk(test)}
     names = {node.id for node in tested if isinstance(node, ast.Name)}
     for node in ast.walk(function):
@@ -179,7 +187,7 @@ def _decided(function: ast.FunctionDef) -> set[ast.AST]:
 
 
 class _Body:
-    """A body, and of which classes its names and expressions are, or what they hold."""
+    """A body, and the classes of its names and expressions, or of their elements."""
 
     def __init__(self, place: Place) -> None:
         function = _definition(place)
@@ -211,87 +219,91 @@ class _Body:
                     self.names.setdefault(name.id, set()).update(self.classes(value))
 
     def classes(self, node: ast.AST) -> set[Place]:
-        """The classes that an expression is of, or holds."""
+        """Returns the classes of an expression, or of its elements."""
         module = self.place.module
         if isinstance(node, ast.Name) and node.id in self.names:
             return self.names[node.id]
         if isinstance(node, ast.Name):
             return {
-                one
-                for one in _resolve(module, node.id)
-                if isinstance(_definition(one), ast.ClassDef)
+                place
+                for place in _resolve(module, node.id)
+                if isinstance(_definition(place), ast.ClassDef)
             }
         if isinstance(node, ast.Attribute):
             owners = self.classes(node.value)
-            found = [_member(owner, node.attr) for owner in owners]
-            known = [(one.module, part) for one, part in found if part is not None]
+            members = [_member(owner, node.attr) for owner in owners]
+            known = [(one.module, part) for one, part in members if part is not None]
             return (
                 {c for path, part in known for c in _classes_in(path, part)}
                 if known
                 else owners
             )
         if isinstance(node, ast.Call):
-            results = [(one.module, _definition(one).returns) for one in self.called(node.func)]  # type: ignore[union-attr]
+            results = [
+                (place.module, _definition(place).returns) for place in self.called(node.func)
+            ]  # type: ignore[union-attr]
             classes = {c for path, part in results if part for c in _classes_in(path, part)}
             return (
                 classes
                 or self.classes(node.func)
-                or {c for one in node.args for c in self.classes(one)}
+                or {c for inner in node.args for c in self.classes(inner)}
             )
         below = ast.iter_child_nodes(node)
         return (
-            {c for one in below for c in self.classes(one)}
+            {c for inner in below for c in self.classes(inner)}
             if isinstance(node, ast.expr)
             else set()
         )
 
     def called(self, node: ast.AST) -> list[Place]:
         """The functions, methods and properties of the rooms that an expression leads to."""
-        found: list[Place] = []
+        places: list[Place] = []
         if (
             isinstance(node, ast.Name)
             and isinstance(node.ctx, ast.Load)
             and node.id not in self.names
         ):
-            found = _resolve(self.place.module, node.id)
+            places = _resolve(self.place.module, node.id)
         elif isinstance(node, ast.Attribute):
             above = _module_names(self.place.module).get(getattr(node.value, "id", ""))
             owners = sorted(self.classes(node.value))
-            found = [_member(owner, node.attr)[0] for owner in owners]
-            found = [Place(above, node.attr)] if isinstance(above, Path) else found
+            places = [_member(owner, node.attr)[0] for owner in owners]
+            places = [Place(above, node.attr)] if isinstance(above, Path) else places
         return [
-            one
-            for one in found
-            if isinstance(_definition(one), ast.FunctionDef) and _in_rooms(one)
+            place
+            for place in places
+            if isinstance(_definition(place), ast.FunctionDef) and _in_rooms(place)
         ]
 
 
-def _in_rooms(place: Place) -> bool:
-    return place.module.relative_to(house.ROOT).parts[1] in ROOMS
+def _in_rooms(definition: Place) -> bool:
+    return definition.module.relative_to(house.ROOT).parts[1] in ROOMS
 
 
 @cache
 def _member(owner: Place, name: str) -> tuple[Place, ast.expr | None]:
-    """A method or field of a class or of those that it derives from, and what it gives."""
-    node, place = _definition(owner), owner._replace(name=f"{owner.name}.{name}")
-    method = _definition(place)
+    """Returns a method or field of a class or of its bases, and the type of its value."""
+    node, member_place = _definition(owner), owner._replace(name=f"{owner.name}.{name}")
+    method = _definition(member_place)
     if isinstance(method, ast.FunctionDef):
-        return place, method.returns
+        return member_place, method.returns
     for field in _fields(node) if isinstance(node, ast.ClassDef) else ():
         if isinstance(field.target, ast.Name) and field.target.id == name:
-            return place, field.annotation
+            return member_place, field.annotation
     for base in node.bases if isinstance(node, ast.ClassDef) else ():
-        for one in _classes_in(owner.module, base) - {owner}:
-            found = _member(one, name)
+        for base_class in _classes_in(owner.module, base) - {owner}:
+            found = _member(base_class, name)
             if found[1] is not None:
                 return found
-    return place, None
+    return member_place, None
 
 
 def _classes_in(path: Path, part: ast.expr) -> set[Place]:
     """The classes that an annotation names."""
-    found = {one for name in _names_in(part) for one in _resolve(path, name)}
-    return {one for one in found if isinstance(_definition(one), ast.ClassDef)}
+    definitions = {
+        definition for name in _names_in(part) for definition in _resolve(path, name)
+    }
+    return {place for place in definitions if isinstance(_definition(place), ast.ClassDef)}
 
 
 def _in_order(node: ast.AST) -> Iterator[ast.AST]:
@@ -304,8 +316,8 @@ def walk(*starts: Place) -> Walk:
     """Returns the walk from some functions."""
     seen, stays, returns = set(starts), list(starts), []
 
-    def read(place: Place) -> None:
-        body = _Body(place)
+    def read(definition: Place) -> None:
+        body = _Body(definition)
         decided = _decided(body.function)
         for node in (
             inner for statement in body.function.body for inner in _in_order(statement)
@@ -325,7 +337,7 @@ def walk(*starts: Place) -> Walk:
 
 
 def walk_to_judgement() -> Walk:
-    """Returns the walk from a log to what decides the exit code of `trilat certify`."""
+    """Returns the walk from a log to the exit code of `trilat certify`."""
     return walk(Place(CERTIFICATE, "certify"), Place(CERTIFICATE, "Certificate.accepts"))
 
 

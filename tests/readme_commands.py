@@ -189,21 +189,25 @@ def list_missing_commands(commands: set[str]) -> set[str]:
     run = [shlex.split(command)[1:] for command in list_all() if command.startswith("trilat ")]
     for page in PAGES:
         for block in find_blocks(page):
-            run += [words[1:] for words, _ in read_commands(block.text) if words[0] == "trilat"]
-    done = {f"{words[0]} {word}" for words in run for word in words[1:]} | {
-        words[0] for words in run
+            run += [
+                arguments[1:]
+                for arguments, _ in read_commands(block.text)
+                if arguments[0] == "trilat"
+            ]
+    done = {f"{arguments[0]} {word}" for arguments in run for word in arguments[1:]} | {
+        arguments[0] for arguments in run
     }
     named = read_listed_commands()
     assert all(
-        name in commands or any(one.startswith(f"{name} ") for one in commands)
+        name in commands or any(documented.startswith(f"{name} ") for documented in commands)
         for name in named
     )
     wanted = {
-        one
-        for one in commands
-        if one in named or any(one.startswith(f"{name} ") for name in named)
+        documented
+        for documented in commands
+        if documented in named or any(documented.startswith(f"{name} ") for name in named)
     }
-    return {one for one in wanted if one not in done}
+    return {documented for documented in wanted if documented not in done}
 
 
 def read_wishes() -> list[tuple[str, list[str]]]:

@@ -29,7 +29,7 @@ s = {{ m = 1.0 }}
 
 
 def planar_task(duration_s: float = 2.0, rate_hz: int = 1000, elbow_rad: float = 1.7) -> str:
-    """The text of two planar arms in task space."""
+    """Returns the text of two planar arms in task space."""
     return PLANAR.format(duration_s=duration_s, rate_hz=rate_hz, elbow_rad=elbow_rad)
 
 
@@ -68,5 +68,7 @@ s = {{ m1 = 0.7, m2 = 0.3 }}
 
 
 def posed_arms(duration_s: float = 2.0) -> str:
-    """The text of three arms that agree on a place and an orientation; two of them have a joint to spare."""
+    """Returns the text of three arms that agree on a place and an orientation; two of them have
+    a redundant joint.
+    """
     return POSED.format(duration_s=duration_s)

@@ -1,4 +1,4 @@
-"""What `import trilat_net` offers: all that the command can do, described by examples that run."""
+"""The interface of `import trilat_net`: every function of the command, documented by examples that run."""
 
 import doctest
 import inspect
@@ -25,7 +25,7 @@ from trilat_net.results import Result
 FUNCTIONS = [name for name in tn.__all__ if name != "__version__"]
 
 
-def test_what_a_key_completes_is_what_there_is() -> None:
+def test_completions_are_the_existing_names() -> None:
     assert dir(tn) == sorted(tn.__all__)
     assert all(getattr(tn, name) for name in dir(tn))
 
@@ -41,7 +41,7 @@ def test_what_a_key_completes_is_what_there_is() -> None:
     ],
 )
 def test_a_missing_package_shows_in_the_call(package: str) -> None:
-    """In an interpreter of its own, since whatever was imported before stays."""
+    """In an interpreter of its own, since earlier imports would stay."""
     script = f"""
 import sys
 sys.modules[{package!r}] = None
@@ -133,7 +133,9 @@ def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_its_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_example_of_a_docstring_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     text = inspect.getdoc(getattr(tn, name)) or ""
     example = doctest.DocTestParser().get_doctest(text, {"tn": tn}, name, None, None)
@@ -178,7 +180,7 @@ RESULTS: dict[str, Callable[[Path], Result]] = {
 
 
 @pytest.mark.parametrize("command", RESULTS)
-def test_a_result_says_what_its_command_prints(
+def test_results_print_as_their_command_does(
     command: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By a short name: the command lays out tables for the width of its terminal."""
@@ -206,7 +208,7 @@ def test_a_result_says_what_its_command_prints(
     assert len(frame) == len(found.to_rows()) > 0
 
 
-def test_a_simulated_log_is_saved_as_the_command_writes_it(tmp_path: Path) -> None:
+def test_saved_simulations_equal_the_commands_files(tmp_path: Path) -> None:
     log = tn.simulate("jitter", duration_s=0.3, seed=4)
     log.save(tmp_path / "api.mcap")
     trilat("sim", "jitter", "--duration", "0.3", "--seed", "4", "-o", "cli.mcap", cwd=tmp_path)
@@ -215,14 +217,14 @@ def test_a_simulated_log_is_saved_as_the_command_writes_it(tmp_path: Path) -> No
         log.save(tmp_path / "api.mcap")
 
 
-def test_nothing_changes_a_log_by_accident(file: Path) -> None:
+def test_logs_are_not_changed_by_accident(file: Path) -> None:
     site = tn.open_log(file)["m"]
     for values in (site.q, site.t_s, site.tick, site.used["s"], site.theta_hat):
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 1
 
 
-def test_a_log_completes_its_sites_and_becomes_a_frame(file: Path) -> None:
+def test_logs_complete_sites_and_become_frames(file: Path) -> None:
     log = tn.open_log(file)
     assert log._ipython_key_completions_() == ["m", "s"]
     assert list(log.to_frame()["records"]) == [200, 200]
@@ -232,7 +234,7 @@ def test_a_log_completes_its_sites_and_becomes_a_frame(file: Path) -> None:
     assert len(log.to_frame("events")) == len(log.events)
 
 
-def test_scenario_is_name_text_its_tables_or_itself(tmp_path: Path) -> None:
+def test_scenarios_are_names_texts_tables_or_themselves(tmp_path: Path) -> None:
     named = tn.load_scenario("two_sites", ["duration_s=0.5"])
     text = named.text
     (tmp_path / "mine.toml").write_text(text)
@@ -251,7 +253,7 @@ def test_a_log_is_a_mapping_of_its_sites(file: Path) -> None:
     assert log != tn.open_log(file)
 
 
-def test_a_run_that_diverged_says_so() -> None:
+def test_diverged_runs_are_marked() -> None:
     keys = {"limits.qd_limit_rad_s": 0.5}
     with pytest.warns(
         RuntimeWarning, match=r"the run diverged at .* s, and ends there"
@@ -331,14 +333,14 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_errors_in_python_are_of_one_type_and_name_arguments(what: str, file: Path) -> None:
+def test_python_errors_have_one_type_with_arguments(what: str, file: Path) -> None:
     call, told = WRONG[what]
     with pytest.raises(TrilatError, match=told) as caught:
         call(file)
     assert "--" not in str(caught.value)
 
 
-def test_an_error_names_arguments_and_whole_commands() -> None:
+def test_errors_name_arguments_and_whole_commands() -> None:
     error = UsageError(
         "x: trilat log recover x --force; or take -o, --seeds 5, --keys DIR or --force"
     )
@@ -369,20 +371,20 @@ def test_a_law_is_given_as_its_class() -> None:
     assert trial.overrides == ('control.law="tests.laws:Adaptive"',)
 
     class Local(Adaptive):
-        """Of no file's own."""
+        """A law defined in no file."""
 
     with pytest.raises(ScenarioError, match="is not defined in a file"):
         tn.simulate("two_sites", {"control.law": Local})
 
 
-def test_errors_name_pages_that_are_there() -> None:
+def test_pages_named_in_errors_exist() -> None:
     with pytest.raises(ScenarioError) as refused:
         tn.simulate("two_sites", {"control.law": "tests.laws:nobody"}, duration_s=0.1)
     assert Path(str(refused.value).rpartition("see ")[2]).is_file()
 
 
 @pytest.mark.long
-def test_the_table_of_keys_is_that_of_the_results() -> None:
+def test_the_table_of_keys_matches_the_results() -> None:
     assert TABLE.read_text(encoding="utf-8") == build_table()
 
 

@@ -1,4 +1,4 @@
-"""CITATION.cff, pyproject.toml, LICENSE and the BibTeX of `trilat certify --cite` tell the same."""
+"""CITATION.cff, pyproject.toml, LICENSE and the BibTeX of `trilat certify --cite` agree."""
 
 import csv
 import re
@@ -20,18 +20,18 @@ PAPER_YEAR = "2016"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-def said(key: str) -> str:
-    """A value at the top of the file."""
+def read_field(key: str) -> str:
+    """Returns a value at the top of the file."""
     (value,) = re.findall(rf"^{key}: \"?(.*?)\"?$", CITATION, re.MULTILINE)
     return str(value)
 
 
-def test_they_name_the_same_program() -> None:
-    assert said("cff-version") == "1.2.0"
-    assert said("type") == "software"
-    assert said("title") == PROJECT["name"]
-    assert said("version") == PROJECT["version"]
-    assert said("abstract") == PROJECT["description"]
+def test_all_files_name_the_same_program() -> None:
+    assert read_field("cff-version") == "1.2.0"
+    assert read_field("type") == "software"
+    assert read_field("title") == PROJECT["name"]
+    assert read_field("version") == PROJECT["version"]
+    assert read_field("abstract") == PROJECT["description"]
     listed = re.findall(
         r"^  - \"?(.*?)\"?$",
         CITATION.split("keywords:")[1].split("references:")[0],
@@ -40,9 +40,9 @@ def test_they_name_the_same_program() -> None:
     assert listed == PROJECT["keywords"]
 
 
-def test_they_name_the_same_licence_and_holder() -> None:
+def test_all_files_name_one_licence_and_holder() -> None:
     licence = (ROOT / "LICENSE").read_text(encoding="utf-8")
-    assert said("license") == PROJECT["license"] == "MIT"
+    assert read_field("license") == PROJECT["license"] == "MIT"
     assert licence.startswith("MIT License")
     (holder,) = re.findall(r"^Copyright \(c\) \d{4} (.+)$", licence, re.MULTILINE)
     (author,) = re.findall(r"^authors:\n  - name: \"(.+)\"$", CITATION, re.MULTILINE)
@@ -57,7 +57,7 @@ def test_the_paper_is_a_reference() -> None:
     assert f"year: {PAPER_YEAR}" in reference
 
 
-def test_the_list_of_works_has_the_paper_and_as_many_works_as_the_page_says() -> None:
+def test_the_references_list_their_stated_number() -> None:
     with (ROOT / "docs/data/references.csv").open(encoding="utf-8", newline="") as file:
         works = list(csv.DictReader(file))
     page = (ROOT / "docs/reference/references.md").read_text(encoding="utf-8")
@@ -71,7 +71,7 @@ def test_the_list_of_works_has_the_paper_and_as_many_works_as_the_page_says() ->
     ("scenario", "works"),
     [("paper", {"Motaharifar2016"}), ("p_d_margin", {"Nuno2009"})],
 )
-def test_the_paragraph_cites_the_works_that_it_lists(scenario: str, works: set[str]) -> None:
+def test_the_paragraph_cites_its_listed_works(scenario: str, works: set[str]) -> None:
     log = trilat_net.simulate(scenario, duration_s=2.0)
     paragraph, _, *entries = compose_citation(log, trilat_net.certify(log))
     cited = set(re.findall(r"\\cite\{(\w+)\}", paragraph))
@@ -80,7 +80,7 @@ def test_the_paragraph_cites_the_works_that_it_lists(scenario: str, works: set[s
     assert listed & {"Motaharifar2016", "Nuno2009"} == works
 
 
-def test_the_entry_of_the_paper_is_that_of_the_citation_file() -> None:
+def test_the_papers_entry_is_the_citation_files() -> None:
     log = trilat_net.simulate("paper", duration_s=1.0)
     (entry,) = (
         entry

@@ -1,4 +1,4 @@
-"""What docstrings and pages name in backticks exists: modules, classes, functions, keys, options, tests."""
+"""Names in backticks in docstrings and pages exist: modules, classes, functions, keys, options, tests."""
 
 import re
 
@@ -29,6 +29,7 @@ COMPOSED = re.compile(
     r"|(?:m1|m2|s)[._]\w+(?:\.\w+)*"  # variables of MATLAB files, of a site
     r"|qN_rad|push(?:N|_elbow)_mean_nm"  # metrics of a joint
     r"|gravity[1n]"  # states of a linear loop
+    r"|undelayed_rms_rad"  # a quantity with its unit
     r"|rms_error_rad_(?:mean|half)"  # columns of a sweep with seeds
     r"|did_not_rise|not_judged"  # verdicts, by their texts
     r"|\.\.\._max_\.\.\."
@@ -58,7 +59,7 @@ def test_every_name_in_backticks_is_defined() -> None:
         "test_of_nothing_...",
     ],
 )
-def test_name_that_nothing_defines_is_found(name: str) -> None:
+def test_an_undefined_name_is_found(name: str) -> None:
     names = [Reference("page.md", 1, part) for part in name.split()]
     assert not any(is_defined(reference.name) for reference in names)
 

@@ -1,4 +1,4 @@
-"""The documentation: numbers have a test or a command beside them; commands, tests and limits are real."""
+"""The documentation: every number has a test or a command beside it; commands, tests and limits exist."""
 
 import ast
 import csv
@@ -358,18 +358,18 @@ def flat(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("page", "words", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
+    ("page", "phrase", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
 )
-def test_a_limit_on_a_page_is_the_program_s(
-    page: str, words: str, number: float, own: float
+def test_limits_on_pages_are_the_programs(
+    page: str, phrase: str, number: float, own: float
 ) -> None:
-    assert words in flat(find_page(page).read_text(encoding="utf-8"))
+    assert phrase in flat(find_page(page).read_text(encoding="utf-8"))
     assert number == pytest.approx(own, rel=1e-12)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_section_that_states_a_number_has_what_makes_it(page: Path) -> None:
-    """A command, a test, or a row above that holds a limit to the program's."""
+def test_sections_with_numbers_have_their_source(page: Path) -> None:
+    """A command, a test, or a row above that compares a limit with the program's."""
     limits = [words for name, words, *_ in STATED if name == page.name]
     lacking = [
         section.partition("\n")[0]
@@ -388,7 +388,7 @@ def names_of(path: Path) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 @pytest.mark.push
-def test_a_test_that_a_page_names_exists(page: Path) -> None:
+def test_tests_named_on_pages_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     folders = (ROOT / "tests", *ROOT.glob("packages/*/tests"))
     files = {path.stem: path for folder in folders for path in folder.rglob("*.py")}
@@ -404,7 +404,7 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
         assert known, name
 
 
-def test_every_operator_environment_and_law_stands_in_a_table() -> None:
+def test_operators_environments_and_laws_stand_in_tables() -> None:
     pages = ("docs/reference/laws.md", "docs/reference/operators.md")
     text = "".join((ROOT / page).read_text(encoding="utf-8") for page in pages)
     kinds = [
@@ -416,7 +416,7 @@ def test_every_operator_environment_and_law_stands_in_a_table() -> None:
     ] == []
 
 
-def test_every_threat_of_the_security_page_names_tests_that_are_there() -> None:
+def test_threats_of_the_security_page_name_tests() -> None:
     page = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
     with (ROOT / "docs/data/threats.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
@@ -430,7 +430,7 @@ def test_every_threat_of_the_security_page_names_tests_that_are_there() -> None:
             assert f"def {name}" in (ROOT / file).read_text(encoding="utf-8"), named
 
 
-def test_a_link_that_names_a_page_leads_to_it() -> None:
+def test_links_that_name_a_page_reach_it() -> None:
     pattern = re.compile(r"\[([\w./-]+\.md)\]\(([^)#]+\.md)[^)]*\)")
     wrong = [
         (page.name, label, target)

@@ -1,4 +1,6 @@
-"""The blocks of the documentation: each runs and gives what stands beside it, or there is a reason."""
+"""The blocks of the documentation: each block runs and gives the output beside it, or has a
+stated reason.
+"""
 
 import re
 import shutil
@@ -38,19 +40,19 @@ SCENARIOS = resources.files("trilat_net") / "scenarios"
 OPTIONS = all_options()
 
 
-def test_every_exception_is_one_and_its_test_is_there() -> None:
+def test_every_exception_names_an_existing_test() -> None:
     for name, why in {**ELSEWHERE, **NOT_RUN}.items():
         assert sum(block.name.startswith(name) for block in BLOCKS) >= 1, name
         assert (ROOT / why).is_file() or why in NOT_RUN.values(), why
     assert not ELSEWHERE.keys() & NOT_RUN.keys()
 
 
-def test_every_block_is_run_or_there_is_a_reason() -> None:
+def test_every_block_runs_or_has_a_reason() -> None:
     runs = {"sh": COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
-    known = [block for block in BLOCKS if block.language not in ("", "math")]
-    assert len(known) > 60
+    blocks = [block for block in BLOCKS if block.language not in ("", "math")]
+    assert len(blocks) > 60
     assert not [
-        b.name for b in known if b.page not in runs[b.language] and not find_exception(b)
+        b.name for b in blocks if b.page not in runs[b.language] and not find_exception(b)
     ]
 
 
@@ -65,7 +67,7 @@ def test_every_formula_becomes_mathml(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_command_parses_as_it_is_written(page: str) -> None:
+def test_commands_parse_as_written(page: str) -> None:
     for block in find_blocks(page):
         for words, _ in read_commands(block.text) if block.language == "sh" else ():
             if words[0] == "trilat":
@@ -73,18 +75,18 @@ def test_a_command_parses_as_it_is_written(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
+def test_commands_in_sentences_have_their_options(page: str) -> None:
     for text in re.findall(r"`(trilat [^`]*)`", (ROOT / page).read_text(encoding="utf-8")):
-        words = re.findall(r"[^\s\[\]|,()]+", text)
-        (name, *_) = [w for w in (" ".join(words[:n]) for n in (3, 2, 1)) if w in OPTIONS]
-        below = [one for known, one in OPTIONS.items() if known.startswith(name)]
-        known = {option for one in below for option in one} | {
+        matches = re.findall(r"[^\s\[\]|,()]+", text)
+        (name, *_) = [w for w in (" ".join(matches[:n]) for n in (3, 2, 1)) if w in OPTIONS]
+        below = [names for known, names in OPTIONS.items() if known.startswith(name)]
+        known = {option for option_names in below for option in option_names} | {
             "--help",
             "--version",
             "--install-completion",
         }
-        given = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
-        assert not given - known, text
+        options = {word.partition("=")[0] for word in matches if re.match(r"--?[a-z]", word)}
+        assert not options - known, text
 
 
 # --- settings ---------------------------------------------------------------------------------------------
@@ -164,7 +166,7 @@ def test_settings_make_a_scenario(
 
 
 def write_own_arm(folder: Path, text: str) -> str:
-    """Puts an arm of the package in place of a robot's file that is not shipped; returns the scenario."""
+    """Replaces a robot's file that is not shipped by an arm of the package; returns the scenario."""
     shutil.copy(str(SCENARIOS / "arm6.urdf"), folder / "ur5_robot.urdf")
     return text.replace('"tool0"', '"flange"')
 
@@ -233,7 +235,7 @@ OF_RUNS = {
 
 
 def prepare(page: str, folder: Path) -> None:
-    """Makes the files that a page takes for granted."""
+    """Makes the files that a page assumes."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
     if page == "docs/tutorials/first-hour.md":  # the log of the reader's session
@@ -243,33 +245,33 @@ def prepare(page: str, folder: Path) -> None:
     if page == "docs/extend/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/extend/arms.md":
-        (own,) = (block for block in find_blocks(page) if block.text.startswith("name"))
-        (folder / "mine.toml").write_text(write_own_arm(folder, own.text))
+        (name_block,) = (block for block in find_blocks(page) if block.text.startswith("name"))
+        (folder / "mine.toml").write_text(write_own_arm(folder, name_block.text))
 
 
 @pytest.mark.parametrize(
     "page", list_pages(COMMAND_PAGES - {"docs/tutorials/lab.md"}, PUSHED_COMMAND_PAGES)
 )
-def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
+def test_page_commands_print_their_shown_output(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     for block in find_blocks(page):
         if block.language != "sh" or find_exception(block):
             continue
-        for words, shown in read_commands(block.text):
-            shorter = SHORTER if "--tune" in words else []
-            done = trilat(*words[1:], *shorter, cwd=tmp_path)
-            assert done.code in (0, 1), (words, done)
+        for arguments, output in read_commands(block.text):
+            shorter = SHORTER if "--tune" in arguments else []
+            done = trilat(*arguments[1:], *shorter, cwd=tmp_path)
+            assert done.code in (0, 1), (arguments, done)
             printed = " ".join((done.out + done.err).split())
-            for line in shown:
-                assert line in printed, (words, line, done)
+            for line in output:
+                assert line in printed, (arguments, line, done)
 
 
 @pytest.mark.long
 @pytest.mark.live
-def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
-    words = ("--scenario", "play", "--set", "duration_s=600")
+def test_documented_hands_take_and_release_arms(tmp_path: Path) -> None:
+    arguments = ("--scenario", "play", "--set", "duration_s=600")
     sites = [
-        Process(name, ["site", name, *words], tmp_path)
+        Process(name, ["site", name, *arguments], tmp_path)
         for name in tn.load_scenario("play").names
     ]
     try:
@@ -314,10 +316,10 @@ AT_HAND = {
 
 
 def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> str:
-    """Runs the code of a page in a folder, in one namespace; returns what it prints."""
+    """Runs the code of a page in a folder, in one namespace; returns its output."""
     space: dict[str, Any] = {"__name__": "page"} if names is None else names
-    printed = StringIO()
-    with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
+    stream = StringIO()
+    with redirect_stdout(stream), pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for code in (
             AT_HAND.get(page, ""),
@@ -328,7 +330,7 @@ def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> 
             ),
         ):
             exec(compile(code, page, "exec"), space)
-    return printed.getvalue()
+    return stream.getvalue()
 
 
 def check_linear(printed: str, _: dict[str, Any]) -> None:
@@ -343,20 +345,24 @@ def check_linear_examples(printed: str, _: dict[str, Any]) -> None:
 
 
 def check_ports(_: str, names: dict[str, Any]) -> None:
-    """The lines of the command on docs/studies/ports.md are those of this page's function."""
-    (block,) = (one for one in find_blocks("docs/studies/ports.md") if one.language == "sh")
-    ((_, shown),) = read_commands(block.text)
-    made = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
-    assert shown == [" ".join(line.split()) for line in made[:2]]
+    """Compares the lines of the command on docs/studies/ports.md with those of this page's function."""
+    (block,) = (
+        code_block
+        for code_block in find_blocks("docs/studies/ports.md")
+        if code_block.language == "sh"
+    )
+    ((_, output),) = read_commands(block.text)
+    results = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
+    assert output == [" ".join(line.split()) for line in results[:2]]
 
 
 def check_energies(_: str, names: dict[str, Any]) -> None:
-    """A line that carries 2 N m for a second gave, and took, 2 J."""
+    """Asserts that a line that carries 2 N m for a second took, and gave, 2 J."""
     u = {"u": np.full((1000, 1), 2.0)}
     peers = [SimpleNamespace(sent=u, received=u)]
-    found = names["energies"](None, SimpleNamespace(h_s=1e-3, peers=peers))
-    assert found.gave[0][-1] == pytest.approx(2.0)
-    assert found.took[0][-1] == pytest.approx(2.0)
+    energies = names["energies"](None, SimpleNamespace(h_s=1e-3, peers=peers))
+    assert energies.gave[0][-1] == pytest.approx(2.0)
+    assert energies.took[0][-1] == pytest.approx(2.0)
 
 
 def check_rerun(_: str, names: dict[str, Any]) -> None:
@@ -376,21 +382,21 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 
 
 @pytest.mark.parametrize("page", list_pages(PYTHON_PAGES - OF_THEIR_OWN, PUSHED_PYTHON_PAGES))
-def test_code_of_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
+def test_page_code_finds_its_stated_results(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
-    printed = run_python(page, tmp_path, names)
+    output = run_python(page, tmp_path, names)
     if page in CHECKS:
-        CHECKS[page](printed, names)
+        CHECKS[page](output, names)
     else:
-        assert printed.splitlines() == list_shown(page)
+        assert output.splitlines() == list_shown(page)
 
 
 def list_shown(page: str) -> list[str]:
-    """Returns the lines that a page shows of what its code prints: the block right after the code."""
+    """Returns the output that a page shows: the block right after the code."""
     blocks = find_blocks(page)
     text = (ROOT / page).read_text(encoding="utf-8")
-    shown: list[str] = []
+    output_lines: list[str] = []
     for code, after in pairwise(blocks):
         between = text.partition(code.text)[2].partition(after.text)[0]
         if (
@@ -398,12 +404,12 @@ def list_shown(page: str) -> list[str]:
             and after.language == ""
             and between.split() == ["```", "```text"]
         ):
-            shown += after.text.splitlines()
-    return shown
+            output_lines += after.text.splitlines()
+    return output_lines
 
 
 @pytest.mark.long
-def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
+def test_code_about_sweeps_reads_their_results(tmp_path: Path) -> None:
     over = [
         "--over",
         "link.delay_ms=0,100",
@@ -422,11 +428,11 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
+def test_certificates_begin_as_shown_on_their_page(tmp_path: Path) -> None:
     trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
-    (shown,) = (
+    (output,) = (
         b.text
         for b in find_blocks("docs/logs/certificate.md")
         if b.text.startswith("ok   stable")
     )
-    assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(shown.rstrip())
+    assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(output.rstrip())

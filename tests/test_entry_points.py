@@ -1,4 +1,6 @@
-"""Commands and functions of other packages: which there are, and what is said of those that are missing or broken."""
+"""Commands and functions of other packages: the available names, and the messages for missing
+or broken packages.
+"""
 
 import re
 import sys
@@ -46,7 +48,7 @@ def stated(package: str) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.parametrize("package", PACKAGE_COMMANDS)
-def test_a_package_registers_what_is_said_of_it(package: str) -> None:
+def test_packages_register_their_documented_names(package: str) -> None:
     assert set(stated(package)[COMMANDS]) == set(PACKAGE_COMMANDS[package])
     functions = stated(package).get(FUNCTIONS, {})
     assert set(functions) == set(PACKAGE_FUNCTIONS.get(package, "").split())
@@ -56,7 +58,7 @@ def test_a_package_registers_what_is_said_of_it(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGE_COMMANDS)
-def test_a_purpose_is_the_beginning_of_the_help(package: str) -> None:
+def test_a_purpose_is_the_helps_beginning(package: str) -> None:
     for name, purpose in PACKAGE_COMMANDS[package].items():
         text = find_entries(COMMANDS)[name].load().__doc__.split("\n\n")[0]
         assert " ".join(text.split()) == purpose
@@ -82,7 +84,7 @@ def test_a_missing_package_is_named(installed: Installs, tmp_path: Path) -> None
                 getattr(tn, name)()
 
 
-def test_another_package_adds_a_name_and_replaces_none(
+def test_other_packages_add_names_without_replacing_any(
     installed: Installs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = ModuleType("other_package")

@@ -1,4 +1,4 @@
-"""Examples run as they stand, with and without what they would like to have."""
+"""Examples run unchanged, with and without their optional equipment."""
 
 import itertools
 import math
@@ -15,12 +15,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from device_tests.devices import CapReports, HaplyService
 from trilat_ros2.ros2_bridge import refuse_other_robots
 
 import trilat_net
 from tests.log_editing import recorded
 from tests.net.waiting import until
+from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.app.running_session import open_hand
@@ -61,7 +61,7 @@ def test_a_look_into_a_log(
 
 
 @pytest.mark.long
-def test_springs_with_reactions_rest_where_their_sum_is_zero(
+def test_springs_with_reactions_have_zero_sum(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Forces of springs that act at both ends move no centre: by d qd_i summed, the mean pose stays."""
@@ -78,7 +78,7 @@ def test_springs_with_reactions_rest_where_their_sum_is_zero(
 
 
 class PinnedArm:
-    """Stands in for a hand of a session whose arm nobody moves: a spring of 300 N/m at one place."""
+    """Stands in for a hand of a session whose arm stays still: a spring of 300 N/m at one place."""
 
     def __init__(self, rounds: float = math.inf) -> None:
         self.target, self.moves, self.released, self.rounds = (1.0, 0.5), 0, 0, rounds
@@ -122,7 +122,7 @@ def test_a_device_rests_where_hand_and_user_balance(
 
 
 def device_of(name: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Any:
-    """The device by which an example leads m1 of `play`."""
+    """Returns the device with which an example leads m1 of `play`."""
     led: dict[str, Any] = {}
     session = SimpleNamespace(lead=lambda site, device: led.update({site: device}))
     monkeypatch.setattr(
@@ -159,13 +159,13 @@ def test_spacemouse_example_moves_along_one_axis(monkeypatch: pytest.MonkeyPatch
         assert (state.position_m[0], state.position_m[2]) == (0.0, 0.0)
 
 
-def test_scenario_for_headsets_holds_together() -> None:
+def test_the_headset_scenario_is_stable() -> None:
     log = trilat_net.simulate(LOOK.with_name("headset.toml"), duration_s=0.5)
     assert log.scenario.open_hands == ("m1", "m2")
 
 
 @pytest.mark.parametrize("name", ["two_operators", "two_operators_six_joints"])
-def test_scenarios_of_two_operators_run_with_a_simulated_robot(name: str) -> None:
+def test_two_operator_scenarios_run_with_simulated_robots(name: str) -> None:
     path = LOOK.with_name(f"{name}.toml")
     live = trilat_net.load_scenario(path)
     assert live.outside == ("s",)
@@ -176,7 +176,7 @@ def test_scenarios_of_two_operators_run_with_a_simulated_robot(name: str) -> Non
     assert abs(log["s"].q - log["s"].q[0]).max() < 1e-9  # no arm sinks
 
 
-def test_robot_of_six_joints_follows_a_push_within_its_limits() -> None:
+def test_six_joint_robot_follows_a_push() -> None:
     path = LOOK.with_name("two_operators_six_joints.toml")
     push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [10, 10, 10, 3, 2, 1]}
     settings = list_simulated_settings(trilat_net.load_scenario(path))
@@ -195,7 +195,7 @@ def test_robot_of_six_joints_follows_a_push_within_its_limits() -> None:
         ("external_arm.toml", "robot_two_joints.toml"),
     ],
 )
-def test_file_of_the_robot_fits_its_scenario(example: str, file: str) -> None:
+def test_robot_file_fits_its_scenario(example: str, file: str) -> None:
     scenario = trilat_net.load_scenario(LOOK.with_name(example))
     table = read_topic_table(str(LOOK.with_name(file)))
     robot = table.robots["s"]
@@ -207,14 +207,16 @@ def test_file_of_the_robot_fits_its_scenario(example: str, file: str) -> None:
     assert table.find(scenario.name, "s", "robot_commands") == "effort_controller/commands"
 
 
-def test_a_gamepad_says_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gamepad_names_its_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "evdev", None)
     with pytest.raises(SystemExit, match="pip install evdev"):
         run_with_hand("gamepad_hand.py", PinnedArm(), monkeypatch)
 
 
-def test_a_stick_moves_the_target_and_a_button_lets_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stick held to the right for a second moves the target by 0.3 m; one let go of leaves it there."""
+def test_sticks_move_targets_and_buttons_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stick held to the right for a second moves the target by 0.3 m; a released stick leaves
+    the target there.
+    """
     codes = SimpleNamespace(EV_ABS=3, EV_KEY=1, ABS_X=0, ABS_Y=1, BTN_SOUTH=304)
     at_rest, rounds = SimpleNamespace(min=0, max=255), itertools.count()
     script = {0: (3, 0, 255), 60: (3, 0, 128), 80: (1, 304, 1)}
@@ -228,8 +230,8 @@ def test_a_stick_moves_the_target_and_a_button_lets_go(monkeypatch: pytest.Monke
     pad = SimpleNamespace(
         capabilities=lambda: {3: [(0, at_rest), (1, at_rest)]}, read_one=read_one
     )
-    found = SimpleNamespace(ecodes=codes, list_devices=lambda: ["a"], InputDevice=lambda _: pad)
-    monkeypatch.setitem(sys.modules, "evdev", found)
+    evdev = SimpleNamespace(ecodes=codes, list_devices=lambda: ["a"], InputDevice=lambda _: pad)
+    monkeypatch.setitem(sys.modules, "evdev", evdev)
     arm = PinnedArm(rounds=120)
     run_with_hand("gamepad_hand.py", arm, monkeypatch)
     assert arm.target == pytest.approx((1.3, 0.5), abs=0.012)
@@ -260,7 +262,7 @@ def test_a_switch_is_held_by_keys_until_gaps() -> None:
     assert switch.said == [5 <= n < 60 for n in range(101)]
 
 
-def test_a_switch_is_let_go_when_its_program_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ending_programs_release_their_switch(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = os.pipe()
     os.write(ends[1], b"pressed\n")
     os.close(ends[1])
@@ -269,14 +271,14 @@ def test_a_switch_is_let_go_when_its_program_ends(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"]
     )
-    with os.fdopen(ends[0]) as there:
-        monkeypatch.setattr(sys, "stdin", there)
+    with os.fdopen(ends[0]) as reader:
+        monkeypatch.setattr(sys, "stdin", reader)
         runpy.run_path(str(LOOK.with_name("dead_man_switch.py")), run_name="__main__")
     assert switch.said == [True, False]
 
 
 @pytest.mark.long
-def test_a_program_hands_over_and_back_without_a_step(
+def test_programs_hand_over_without_a_step(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The example in a session without a late tick: no reference steps further while the lead changes."""
@@ -307,11 +309,11 @@ def test_a_program_hands_over_and_back_without_a_step(
 
 
 def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None:
-    """One has time to arrive, the next one ends while the arm still moves."""
+    """One episode has time to arrive, the next one ends while the arm still moves."""
     example = runpy.run_path(str(LOOK.with_name("record_episodes.py")))
     scenario = load_scenario("play", {"duration_s": 6.5, "link.delay_ms": 0.0})
     session = Session.whole(scenario, tmp_path)
-    found: list[bool] = []
+    outcomes: list[bool] = []
 
     def act(bus: Bus, clock: RelayClock) -> None:
         def wait_s(time_s: float) -> None:
@@ -323,7 +325,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
             open_hand(bus, clock, SESSION, "m2", scenario) as follower,
         ):
             for seconds in (4.0, 0.04):
-                found.extend(
+                outcomes.extend(
                     example["record"](
                         running,
                         hand,
@@ -340,7 +342,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
     session.stranger(act)
     log = session.run()
     marks = [event.text for event in log.events if event.kind == "mark"]
-    assert found == [True, False]
+    assert outcomes == [True, False]
     assert [text.removeprefix("episode reach 1 ") for text in marks] == [
         "begins",
         "succeeded",
@@ -351,8 +353,8 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
     assert np.abs(log["m2"].tau_x).max() > 0.0
 
 
-def test_a_person_takes_over_from_a_policy_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a ramp the slave comes to its goal, with smaller steps of the reference than at once."""
+def test_people_take_over_from_failing_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a ramp the slave reaches its goal, with smaller steps of the reference than by a jump."""
     monkeypatch.syspath_prepend(LOOK.parent)
     takeover, weights = (
         runpy.run_path(str(LOOK.with_name("takeover.py"))),
@@ -369,7 +371,7 @@ def test_a_person_takes_over_from_a_policy_that_fails(monkeypatch: pytest.Monkey
 def test_a_trained_policy_acts_alike_as_a_hand(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What an episode's actions did, the class does as a hand of the scenario, bit for bit."""
+    """The class as a hand of the scenario repeats an episode's actions, bit for bit."""
     monkeypatch.syspath_prepend(LOOK.parent)
     study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))
     env = study["make_env"](study["STUDIES"]["reach"], "200 ms, bursts")
@@ -402,10 +404,10 @@ def test_a_study_of_training_reports_intervals(
     short = study["STUDIES"][task]._replace(rounds=1, pairs=1)
     study["STUDIES"][task] = short
     study["run_seed"].__globals__.update(STUDIES=study["STUDIES"], TESTS=1, EPISODE_S=0.4)
-    found = [study["run_seed"](task, seed) for seed in (1, 2)]
-    assert found[0]["weights"] != found[1]["weights"]
-    spans = study["report"](found, short.measure)
+    rates = [study["run_seed"](task, seed) for seed in (1, 2)]
+    assert rates[0]["weights"] != rates[1]["weights"]
+    spans = study["report"](rates, short.measure)
     assert all(low <= mean <= high for mean, low, high in spans.values())
-    study["draw"](found, short.measure, tmp_path / "drawn.png")
+    study["draw"](rates, short.measure, tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").read_bytes().startswith(b"\x89PNG")
     assert "2 seeds, 95 % interval" in capsys.readouterr().out

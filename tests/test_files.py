@@ -1,4 +1,4 @@
-"""An export is there as a whole or not at all, and replaces only what one asks it to replace."""
+"""An export is complete or absent, and replaces only the requested files."""
 
 import ast
 import errno
@@ -48,17 +48,17 @@ def make(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
 
 
 @pytest.mark.parametrize("folder", [False, True])
-def test_what_is_made_is_there_and_nothing_else(folder: bool, tmp_path: Path) -> None:
+def test_only_the_finished_output_remains(folder: bool, tmp_path: Path) -> None:
     make(tmp_path / "out", "1", folder=folder)
-    there = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
-    assert everything(tmp_path) == there
+    expected_files = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
+    assert everything(tmp_path) == expected_files
     with pytest.raises(
         UsageError, match="exists; choose another name, or replace it with force=True"
     ):
         make(tmp_path / "out", "2", folder=folder)
-    assert everything(tmp_path) == there
+    assert everything(tmp_path) == expected_files
     make(tmp_path / "out", "3", folder=folder, force=True)
-    assert everything(tmp_path) == {name: text and "3" for name, text in there.items()}
+    assert everything(tmp_path) == {name: text and "3" for name, text in expected_files.items()}
 
 
 def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
@@ -70,18 +70,18 @@ def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
 @pytest.mark.parametrize("folder", [False, True])
 @pytest.mark.parametrize("before", [False, True])
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no")])
-def test_whatever_goes_wrong_leaves_what_was_there(
+def test_failures_keep_the_former_files(
     folder: bool, before: bool, error: BaseException, tmp_path: Path
 ) -> None:
     if before:
         make(tmp_path / "out", "1", folder=folder)
-    there = everything(tmp_path)
+    former_files = everything(tmp_path)
     with pytest.raises(type(error)):
         break_off(tmp_path / "out", error, folder=folder)
-    assert everything(tmp_path) == there
+    assert everything(tmp_path) == former_files
 
 
-def test_a_full_disk_has_its_exit_code_and_leaves_nothing(tmp_path: Path) -> None:
+def test_full_disks_have_an_exit_code(tmp_path: Path) -> None:
     with pytest.raises(LogRefused, match="No space left") as raised:
         break_off(
             tmp_path / "out", OSError(errno.ENOSPC, "No space left on device"), folder=False
@@ -90,7 +90,7 @@ def test_a_full_disk_has_its_exit_code_and_leaves_nothing(tmp_path: Path) -> Non
     assert everything(tmp_path) == {}
 
 
-def test_a_folder_that_was_not_made_here_is_never_replaced(tmp_path: Path) -> None:
+def test_foreign_folders_are_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years")
     with pytest.raises(UsageError, match="is not an exported folder"):
@@ -109,12 +109,12 @@ def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     assert everything(tmp_path)[f"out/{EXPORT_MANIFEST}"] == "1"
 
 
-def test_a_place_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
+def test_unwritable_places_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"out: cannot be written: No such file"):
         make(tmp_path / "none" / "out", "1", folder=False)
 
 
-def test_a_file_is_written_whole_or_what_was_there_stays(
+def test_files_are_written_whole_or_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "report.json"
@@ -132,9 +132,7 @@ def test_a_file_is_written_whole_or_what_was_there_stays(
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_file_open_elsewhere_stays_as_on_windows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_open_files_stay_as_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows replaces no file that a program has open."""
     write_whole(tmp_path / "report.json", "1")
 
@@ -149,7 +147,7 @@ def test_a_file_open_elsewhere_stays_as_on_windows(
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_folder_without_sync_is_left_as_on_windows(
+def test_unsynced_folders_are_left_as_on_windows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Windows opens no folder."""
@@ -162,19 +160,21 @@ def test_a_folder_without_sync_is_left_as_on_windows(
 
 
 @pytest.mark.push
-def test_every_text_that_is_written_states_its_line_ends() -> None:
-    """A stream of text translates them on Windows; `write_whole` and bytes do not."""
-    found = []
+def test_every_written_text_states_its_line_ends() -> None:
+    """A stream of text translates line ends on Windows; `write_whole` and bytes do not."""
+    calls = []
     for path in house.files():
         for call in (node for node in ast.walk(house.tree(path)) if isinstance(node, ast.Call)):
             name = getattr(call.func, "attr", getattr(call.func, "id", ""))
-            modes = [one.value for one in call.args if isinstance(one, ast.Constant)]
+            modes = [
+                argument.value for argument in call.args if isinstance(argument, ast.Constant)
+            ]
             writes = name == "write_text" or (
                 name == "open" and {"w", "a", "x", "r+", "w+"} & {*modes}
             )
             if writes and "newline" not in {keyword.arg for keyword in call.keywords}:
-                found.append((path.name, call.lineno))
-    assert not found
+                calls.append((path.name, call.lineno))
+    assert not calls
 
 
 @pytest.mark.parametrize("exists", [False, True])
@@ -221,7 +221,7 @@ def test_links_in_place_of_unfinished_files_are_removed(name: str, tmp_path: Pat
     assert (tmp_path / "real").read_text() == "years"
 
 
-def test_hard_links_of_other_files_are_not_written_to(tmp_path: Path) -> None:
+def test_hard_links_elsewhere_are_not_written_to(tmp_path: Path) -> None:
     for name in ("real", "out.mcap.active"):
         (tmp_path / name).write_text("years") if name == "real" else os.link(
             tmp_path / "real", tmp_path / name
@@ -234,14 +234,14 @@ def test_hard_links_of_other_files_are_not_written_to(tmp_path: Path) -> None:
     assert (tmp_path / "real").read_text() == "years"
 
 
-def test_devices_and_links_of_the_system_are_written_to() -> None:
+def test_system_devices_and_links_are_written_to() -> None:
     write_whole(Path("/dev/null"), b"1")
     write_whole(Path("/dev/stdout"), b"")
     assert not Path("/dev/null").is_file()
 
 
-def test_what_has_no_end_is_no_file(tmp_path: Path) -> None:
-    """A pipe without a writer would be waited for, a device read for ever."""
+def test_endless_inputs_are_no_files(tmp_path: Path) -> None:
+    """A pipe without a writer would wait for ever, and a device would be read for ever."""
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(OSError, match="a pipe or a device"):
@@ -253,13 +253,15 @@ def test_what_has_no_end_is_no_file(tmp_path: Path) -> None:
         assert stream.read() == "text"
 
 
-def test_two_at_once_get_folders_of_their_own(
+def test_concurrent_outputs_get_folders_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(lambda _: make_results_folder(None, "x", force=False), range(24)))
-    assert len(set(made)) == 24
+        folders = list(
+            pool.map(lambda _: make_results_folder(None, "x", force=False), range(24))
+        )
+    assert len(set(folders)) == 24
 
 
 def make_clone(folder: Path) -> None:
@@ -339,7 +341,7 @@ def test_the_locks_hold_every_extra() -> None:
             assert f"\n{re.split('[><=]', need)[0]}==" in f"\n{locked}"
 
 
-def test_every_optional_library_has_the_extra_that_installs_it() -> None:
+def test_optional_libraries_have_an_installing_extra() -> None:
     """The table agrees with pyproject.toml, whose names of packages may differ."""
     packages = {"rerun": "rerun-sdk", "mujoco": "mujoco-core"}
     text = (Path(files.__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
@@ -391,7 +393,7 @@ for name in tn.__all__:
         ),
     ],
 )
-def test_without_a_library_only_what_needs_it_is_missing(
+def test_without_a_library_only_dependents_are_missing(
     library: str, functions: set[str]
 ) -> None:
     done = subprocess.run(
@@ -405,7 +407,7 @@ def test_without_a_library_only_what_needs_it_is_missing(
     assert all(f" {library}" in line and line.endswith(remedy) for line in lines)
 
 
-def test_a_library_whose_own_library_is_missing_is_told_apart(
+def test_missing_libraries_of_libraries_are_distinguished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "optional_thing.py").write_text("import that_is_nowhere\n")
@@ -419,7 +421,7 @@ def test_a_library_whose_own_library_is_missing_is_told_apart(
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "run", "a.b.mcap", "run.mcap.active", ".run"])
-def test_the_folder_of_a_report_is_never_the_log(name: str, tmp_path: Path) -> None:
+def test_report_folders_are_never_the_log(name: str, tmp_path: Path) -> None:
     folder = choose_report_folder(tmp_path / name)
     assert folder != tmp_path / name
     assert folder.parent == tmp_path

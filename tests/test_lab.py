@@ -1,4 +1,4 @@
-"""The lab sheet: what it runs goes through, shortened."""
+"""The lab sheet: its commands run, shortened."""
 
 import re
 import shlex
@@ -44,24 +44,26 @@ def test_every_experiment_of_the_lab_runs(tmp_path: Path) -> None:
     trilat("report", "free.mcap", cwd=tmp_path).succeeds()
 
 
-def test_no_command_of_the_sheet_tells_results_before_they_are_predicted() -> None:
-    """`test` prints the limits that a scenario expects, and `show` and `list` print its text, which tells them."""
-    named = {tuple(words[1:3]) for words in COMMANDS}
+def test_no_command_reveals_results_before_predictions() -> None:
+    """`test` prints the limits that a scenario expects, and `show` and `list` print its text,
+    which contains them.
+    """
+    named = {tuple(command[1:3]) for command in COMMANDS}
     assert not {words for words in named if words[0] == "test"}
     assert not {("scenario", "show"), ("scenario", "list")} & named
 
 
 @pytest.mark.long
-def test_verdicts_of_the_jitter_experiment_are_those_of_the_key(tmp_path: Path) -> None:
+def test_jitter_verdicts_are_those_of_the_key(tmp_path: Path) -> None:
     (block,) = (block for block in BLOCKS if "sim jitter -o jitter.mcap" in block)
-    found = []
+    verdicts = []
     for _, command, *rest in map(shlex.split, block.splitlines()):
         if command == "sim":
             trilat(command, *rest, cwd=tmp_path)
             log = rest[rest.index("-o") + 1]
-            words = trilat("certify", log, cwd=tmp_path).out.splitlines()[0]
-            found.append(re.split(r"[;,]| m\d", words)[0])
-    assert found == [
+            first_line = trilat("certify", log, cwd=tmp_path).out.splitlines()[0]
+            verdicts.append(re.split(r"[;,]| m\d", first_line)[0])
+    assert verdicts == [
         "ok   settled: decaying",
         "FAIL not stable: growing",
         "FAIL not stable: diverged:",
@@ -76,10 +78,10 @@ ANSWERS = (Path(__file__).parents[1] / "docs" / "tutorials" / "lab-answers.md").
 def read_groups() -> list[list[float]]:
     """Runs the lecturer's code: per group its number, K, T in ms, a, 1 - a, and three margins."""
     (code,) = re.findall(r"^```python\n(.*?)^```", ANSWERS, re.S | re.M)
-    printed = StringIO()
-    with redirect_stdout(printed):
+    stream = StringIO()
+    with redirect_stdout(stream):
         exec(code, {})
-    return [list(map(float, line.split())) for line in printed.getvalue().splitlines()[1:]]
+    return [list(map(float, line.split())) for line in stream.getvalue().splitlines()[1:]]
 
 
 def list_dominance(a: float) -> dict[str, dict[str, float]]:
@@ -87,7 +89,7 @@ def list_dominance(a: float) -> dict[str, dict[str, float]]:
     return {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": a, "s": rest}, "s": {"m1": a, "m2": rest}}
 
 
-def test_key_of_every_group_is_least_eigenvalue_times_stiffness_and_delay() -> None:
+def test_each_groups_key_is_its_eigenvalue_bound() -> None:
     groups = read_groups()
     assert len({tuple(group[1:4]) for group in groups}) == 15
     for _, K, T_ms, a, rest, three, two, unequal in groups:
@@ -102,7 +104,7 @@ def test_key_of_every_group_is_least_eigenvalue_times_stiffness_and_delay() -> N
             assert margin == pytest.approx(-least * K * T_ms / 1000.0, abs=6e-4)
 
 
-def test_no_command_of_the_sheet_needs_a_shell_of_unix() -> None:
+def test_no_command_needs_a_unix_shell() -> None:
     """PowerShell and `cmd` know neither a backslash at the end of a line, nor quotes of `cmd` like '."""
     for block in BLOCKS:
         assert "\\\n" not in block
@@ -111,17 +113,17 @@ def test_no_command_of_the_sheet_needs_a_shell_of_unix() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("group", [1, 5, 14, 15])
-def test_every_group_finds_its_prediction_at_most_10_percent_above_the_edge(group: int) -> None:
-    """As the commands under "check yourself" do: about the rest of a run with d = 5."""
+def test_predictions_lie_within_10_percent_of_edges(group: int) -> None:
+    """With the commands under "check yourself": about the rest of a run with d = 5."""
     _, K, T_ms, a, _, *margins = read_groups()[group - 1]
-    checks = [words for words in COMMANDS if words[1] == "linear"]
+    checks = [arguments for arguments in COMMANDS if arguments[1] == "linear"]
     assert len(checks) == 3
-    for words, predicted in zip(checks, margins, strict=True):
+    for arguments, predicted in zip(checks, margins, strict=True):
         keys: dict[str, Any] = {"control.K": K, "link.delay_ms": T_ms, "control.d": 5.0}
-        assert {"control.d=5", "control.d=0.1:5"} <= set(words)
-        if any(word.startswith("dominance") for word in words):
+        assert {"control.d=5", "control.d=0.1:5"} <= set(arguments)
+        if any(word.startswith("dominance") for word in arguments):
             keys["dominance"] = list_dominance(a)
-        loaded = trilat_net.load_scenario(words[2], keys)
+        loaded = trilat_net.load_scenario(arguments[2], keys)
         edges = [edge.value for edge in iterate_linear_edges(loaded, "control.d", 0.1, 5.0)]
         assert len(edges) == 1
         assert edges[0] <= predicted <= 1.1 * edges[0]

@@ -23,7 +23,7 @@ def list_files(*patterns: str) -> list[str]:
     return listed.stdout.split()
 
 
-def test_every_file_of_examples_and_top_level_is_on_a_page() -> None:
+def test_pages_name_all_examples_and_top_files() -> None:
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     named = set(re.findall(r"[\w.-]+", text))

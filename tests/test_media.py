@@ -69,7 +69,7 @@ def test_every_motion_lasts_as_long_as_the_run() -> None:
     assert counts == {frames}
 
 
-def test_gallery_has_twelve_pictures_each_with_its_commands() -> None:
+def test_gallery_pictures_have_their_commands() -> None:
     assert len(ENTRIES) + GALLERY_TEXT.count(f"```sh\n{GALLERY.MAKE_ALL}\n") == 12
     names = [entry.path.parts[0] for entry in ENTRIES]
     assert len(set(names)) == len(names)
@@ -90,17 +90,17 @@ def test_gallery_has_twelve_pictures_each_with_its_commands() -> None:
 )
 def test_commands_of_gallery_make_its_pictures(entry: Any, tmp_path: Path) -> None:
     """To the byte: the same version of the program draws the same picture."""
-    made = GALLERY.make_picture(entry, tmp_path)
-    assert made.read_bytes() == (GALLERY.PICTURES / entry.path).read_bytes()
+    picture = GALLERY.make_picture(entry, tmp_path)
+    assert picture.read_bytes() == (GALLERY.PICTURES / entry.path).read_bytes()
 
 
-def test_the_picture_of_a_report_has_the_size_of_its_window() -> None:
+def test_report_pictures_have_their_windows_size() -> None:
     pixels = matplotlib.image.imread(REPORT.PICTURE)
     height, width = pixels.shape[:2]
     assert (width, height) == (REPORT.SCALE * REPORT.WIDTH, REPORT.SCALE * REPORT.HEIGHT)
 
 
-def test_the_picture_of_a_report_names_the_browser_that_it_lacks(
+def test_report_pictures_name_their_missing_browser(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("PATH", "")

@@ -1,4 +1,4 @@
-"""examples/mujoco: the scenario's arm in MuJoCo moves as our own does, and pushes what stands there."""
+"""examples/mujoco: the scenario's arm moves in MuJoCo as in the program, and pushes other bodies."""
 
 from pathlib import Path
 from typing import Any
@@ -18,30 +18,35 @@ def _beside_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def apart_rad(name: str, rate_hz: int, **more: Any) -> float:
-    """How far the slave gets from where our own dynamics take it, in free motion."""
+    """Returns the largest distance of the slave from its motion under the program's dynamics,
+    in free motion.
+    """
     overrides = {"rate_hz": rate_hz, "link.delay_ms": 50, **more}
     plant = {"sites.s.plant": {"class": "scene:Scene", "thing": "nothing"}}
     ours, theirs = (
-        tn.simulate(name, {**overrides, **one}, duration_s=1.5) for one in ({}, plant)
+        tn.simulate(name, {**overrides, **plant_keys}, duration_s=1.5)
+        for plant_keys in ({}, plant)
     )
     return float(np.abs(ours["s"].q - theirs["s"].q).max())
 
 
-def test_free_motion_differs_by_the_order_of_the_period() -> None:
-    """The torque of a tick acts from it on, ours is extrapolated to its middle: of first order in h."""
+def test_free_motion_differs_by_the_periods_order() -> None:
+    """The torque of a tick acts from that tick on, the program's is extrapolated to the middle:
+    of first order in h.
+    """
     coarse, fine = apart_rad("paper", 500), apart_rad("paper", 1000)
     assert 0.0 < fine < 0.004
     assert 1.8 < coarse / fine < 2.2
 
 
 @pytest.mark.long
-def test_an_arm_of_a_urdf_is_the_same_arm() -> None:
+def test_urdf_arms_are_the_same_arm() -> None:
     coarse, fine = apart_rad("unlike_arms", 500), apart_rad("unlike_arms", 1000)
     assert 0.0 < fine < 0.02
     assert 1.5 < coarse / fine < 2.5
 
 
-def test_the_box_is_pushed_and_the_users_feel_it() -> None:
+def test_pushed_boxes_are_felt_by_the_users() -> None:
     nothing = {"sites.s.plant.thing": "nothing", "sites.s.plant.bodies": {}}
     free, box = (tn.simulate("push.toml", thing, duration_s=6) for thing in (nothing, {}))
     place_m = box["s"].bodies[:, :3]
@@ -57,7 +62,7 @@ def test_runs_on_one_machine_have_the_same_bits() -> None:
     assert np.array_equal(logs[0]["s"].q, logs[1]["s"].q)
 
 
-def test_a_thing_that_it_has_not_is_named() -> None:
+def test_a_missing_body_is_named() -> None:
     with pytest.raises(
         ScenarioError, match="thing is one of nothing, box, door, slot, not 'cup'"
     ):

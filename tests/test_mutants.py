@@ -1,4 +1,4 @@
-"""The changes that judge the tests: one token each, drawn by a seed."""
+"""The mutants that judge the tests: each changes one token and is drawn by a seed."""
 
 import ast
 import io
@@ -12,20 +12,20 @@ from .mutants import draw_mutants
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_mutant_is_one_token_of_code(seed: int) -> None:
-    drawn = draw_mutants(seed, 40)
-    assert drawn == draw_mutants(seed, 40)
-    assert len(set(drawn)) == 40
-    for mutant in drawn:
+    mutants = draw_mutants(seed, 40)
+    assert mutants == draw_mutants(seed, 40)
+    assert len(set(mutants)) == 40
+    for mutant in mutants:
         before, after = (
             [
-                one.string
-                for one in tokenize.generate_tokens(io.StringIO(text).readline)
-                if one.string.strip()
+                token.string
+                for token in tokenize.generate_tokens(io.StringIO(text).readline)
+                if token.string.strip()
             ]
             for text in (mutant.path.read_text(encoding="utf-8"), mutant.apply())
         )
-        at = next(n for n, one in enumerate(before) if after[n] != one)
+        at = next(n for n, line in enumerate(before) if after[n] != line)
         assert before[at] == mutant.was
         assert [*before[:at], *([mutant.now] if mutant.now else []), *before[at + 1 :]] == after
         ast.parse(mutant.apply())
-    assert {house.room(mutant.path) for mutant in drawn} == {"core", "log", "analysis"}
+    assert {house.room(mutant.path) for mutant in mutants} == {"core", "log", "analysis"}

@@ -1,4 +1,4 @@
-"""The notebooks of `examples/`: executed, and the facts that they state hold; kept without outputs."""
+"""The notebooks of `examples/` run, and their stated facts hold; they are stored without outputs."""
 
 import json
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_every_notebook_has_facts_and_no_outputs() -> None:
 @pytest.mark.long
 @pytest.mark.filterwarnings("default")  # of its packages
 @pytest.mark.parametrize("name", FACTS)
-def test_a_notebook_runs_and_says_what_is_true(name: str, tmp_path: Path) -> None:
+def test_a_notebook_runs_and_its_facts_hold(name: str, tmp_path: Path) -> None:
     nbclient = pytest.importorskip("nbclient", reason="make test-long installs it")
     nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
@@ -81,6 +81,10 @@ def test_values_show_themselves_in_a_notebook(tmp_path: Path) -> None:
         notebook, timeout=600, kernel_name="python3", resources=where
     ).execute()
     for cell, kind in zip(notebook.cells[1:], SHOWN.values(), strict=True):
-        (output,) = (one for one in cell.outputs if one.output_type == "execute_result")
+        (output,) = (
+            cell_output
+            for cell_output in cell.outputs
+            if cell_output.output_type == "execute_result"
+        )
         assert kind in output.data, cell.source
         assert len(output.data[kind]) > 200, cell.source

@@ -1,8 +1,8 @@
-"""Numbers on the pages are what the program makes of the commands, runs and formulas beside them.
+"""Numbers on the pages equal the results of the commands, runs and formulas beside them.
 
-A row has a page's words with `{}` for each number, and what makes the numbers, in that order, or a text in which
-the same words stand. A number of the page must agree with the one that is made to six tenths of its last printed
-digit.
+A row has a page's words with `{}` for each number, and the source of the numbers in that order,
+or a text in which the same words stand. A number of the page must agree with its source to six
+tenths of its last printed digit.
 """
 
 import csv
@@ -81,26 +81,26 @@ def keys(changes: Changes) -> Changes:
 
 
 def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[float, float]:
-    found = analyse_linear_loop(
+    analysis = analyse_linear_loop(
         load_scenario(name, changes), pose=pose, roots=1
     ).continuous.rightmost
-    assert found is not None
-    return found.s.real, abs(found.s.imag)
+    assert analysis is not None
+    return analysis.s.real, abs(analysis.s.imag)
 
 
 def root(
     name: str, changes: Changes | None = None, pose: Pose | None = None
 ) -> tuple[float, float]:
-    """The rightmost root that decides, the upper one of a pair."""
-    found = analyse_linear_loop(
+    """Returns the rightmost root that decides, the upper one of a pair."""
+    analysis = analyse_linear_loop(
         load_scenario(name, changes or {}), pose=pose, roots=1
     ).decisive.rightmost
-    assert found is not None
-    return found.s.real, abs(found.s.imag)
+    assert analysis is not None
+    return analysis.s.real, abs(analysis.s.imag)
 
 
 def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
-    """The largest common delay, ms, and the frequency there, rad/s."""
+    """Returns the largest common delay, ms, and the frequency there, rad/s."""
     high = (
         analyse_linear_loop(load_scenario(name, changes or {}), roots=1)
         .margin.intervals[0]
@@ -115,9 +115,9 @@ def edge(
 ) -> float:
     scenario = load_scenario(name, changes)
     rest = None if pose is None else find_equilibrium(scenario, pose)
-    found = next(iterate_linear_edges(scenario, key, low, high, rest), None)
-    assert found is not None
-    return found.value
+    edge_found = next(iterate_linear_edges(scenario, key, low, high, rest), None)
+    assert edge_found is not None
+    return edge_found.value
 
 
 def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
@@ -126,7 +126,9 @@ def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
 
 
 def common_motion() -> tuple[float, float, float]:
-    """What the common motion asks of d, of K T: the largest -sin x / x; the mass there, two factors of it."""
+    """Returns the damping that the common motion needs, in K T: the largest -sin x / x; the
+    mass there, and two factors of it.
+    """
     x = brentq(lambda x: math.tan(x) - x, 4.4, 4.6)
     return -math.sin(x) / x, 1.0 - math.cos(x), x**2
 
@@ -139,34 +141,41 @@ def ports(name: str, **changes: Any) -> PortAnalysis:
     return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
 
-def felt(made: PortAnalysis) -> Any:
-    return next(one for one in made.transparency if (one.operator_site, one.joint) == ("m", 1))
+def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
+    return next(
+        one for one in port_analysis.transparency if (one.operator_site, one.joint) == ("m", 1)
+    )
 
 
 def learning(delay_ms: float) -> Numbers:
-    made = ports("two_sites", link__delay_ms=delay_ms)
-    assert made.proof is not None
-    assert made.proof.passive
-    (band,), least = made.velocity.minima.below, made.velocity.minima
+    analysed = ports("two_sites", link__delay_ms=delay_ms)
+    assert analysed.proof is not None
+    assert analysed.proof.passive
+    (band,), least = analysed.velocity.minima.below, analysed.velocity.minima
     return (
         *band[:2],
         least.least,
         least.least_hz,
-        *felt(made).interpolate_magnitudes(1.0),
-        felt(made).ratio_db,
+        *find_felt_impedance(analysed).interpolate_magnitudes(1.0),
+        find_felt_impedance(analysed).ratio_db,
     )
 
 
 def known(delay_ms: float) -> float:
-    made = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
-    assert made.velocity.passive
-    return float(felt(made).ratio_db)
+    analysed = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
+    assert analysed.velocity.passive
+    return float(find_felt_impedance(analysed).ratio_db)
 
 
 def lacking() -> Numbers:
-    made = ports("p_d_margin_two", control__d=1.96).velocity
-    (band,) = made.minima.below
-    return (*band[:2], made.minima.least, made.minima.least_hz, made.lacking_nm_s_rad)
+    velocity = ports("p_d_margin_two", control__d=1.96).velocity
+    (band,) = velocity.minima.below
+    return (
+        *band[:2],
+        velocity.minima.least,
+        velocity.minima.least_hz,
+        velocity.lacking_nm_s_rad,
+    )
 
 
 def reflecting(delay_ms: float, d: float) -> PortAnalysis:
@@ -175,9 +184,9 @@ def reflecting(delay_ms: float, d: float) -> PortAnalysis:
 
 
 def stable_with_any(delay_ms: float, d: float) -> Numbers:
-    made = reflecting(delay_ms, d)
-    assert not made.absolute.below
-    return [felt(made).ratio_db]
+    network = reflecting(delay_ms, d)
+    assert not network.absolute.below
+    return [find_felt_impedance(network).ratio_db]
 
 
 # -- runs
@@ -185,36 +194,36 @@ def stable_with_any(delay_ms: float, d: float) -> Numbers:
 
 def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
     scenario = load_scenario(name, keys(changes))
-    made = FusedRun(scenario)
-    made.advance_to(duration_s or scenario.duration_s)
-    return made
+    fused_run = FusedRun(scenario)
+    fused_run.advance_to(duration_s or scenario.duration_s)
+    return fused_run
 
 
 def rms_of_free(delay_ms: float) -> float:
-    """Of e over 20 s, of all joints and sites together, rad."""
-    made = sampled(
+    """Returns the RMS of e over 20 s, of all joints and sites together, rad."""
+    records = sampled(
         load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02)
     )
-    return float(np.sqrt(((made[..., :2] - made[..., 4:6]) ** 2).mean()))
+    return float(np.sqrt(((records[..., :2] - records[..., 4:6]) ** 2).mean()))
 
 
-def seen(
-    name: str, asked: str, *windows: tuple[float, float, str], **changes: Any
+def measure_windows(
+    name: str, quantity: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
-    """Quantities of windows of a run, window by window."""
-    made = measured(name, keys(changes), *windows)
-    return [value(made, key, n) for n in range(len(windows)) for key in asked.split()]
+    """Returns quantities of windows of a run, window by window."""
+    values = measured(name, keys(changes), *windows)
+    return [value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
 
 
 def age(**changes: Any) -> float:
-    """Mean age of the samples in use in `jitter`, ms."""
+    """Returns the mean age of the samples in use in `jitter`, ms."""
     return float(
         np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()])
     )
 
 
 def anchored(delay_s: float, duration_s: float) -> Numbers:
-    """The final angle of the first joint in `paper`: predicted, and of a run."""
+    """Returns the final angle of the first joint in `paper`: predicted, and of a run."""
     predicted = math.asin(-2.0 / (G * (1.0 + delay_s)))
     return predicted, fused("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
 
@@ -237,7 +246,7 @@ def rise(V: Any) -> Numbers:
 
 
 def energy_of_healing() -> Numbers:
-    """What the links give to the slave of `outage` as they heal, J."""
+    """Returns the energy that the links give to the slave of `outage` as they heal, J."""
     balance = runs.run("outage").balance
     healed = slice(*np.searchsorted(balance.t_s, (6.19, 6.21)))
     return (float(np.ptp(balance.work[f"{peer}->s"][healed])) for peer in ("m1", "m2"))
@@ -250,18 +259,20 @@ def certified(folder: Path) -> str:
 
 
 def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
-    """The mean age in use by the sums of docs/data/age-in-use.txt, at 1 kHz, ms."""
+    """Returns the mean age in use by the sums of docs/data/age-in-use.txt, at 1 kHz, ms."""
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
 def distances(scheme: str) -> list[float]:
-    """From the exact solution of `paper`, rad, at three rates, and the orders between them."""
+    """Returns distances from the exact solution of `paper`, rad, at three rates, and the orders
+    between them.
+    """
     far = [delay_equations.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
     return [*far, *delay_equations.order("paper", scheme)]
 
 
 def shipped_trials() -> list[Any]:
-    """What `trilat test --seeds 1..20` runs."""
+    """Returns the trials of `trilat test --seeds 1..20`."""
     return [trial for name in SHIPPED for trial in trilat_net.trials(name, seeds=range(1, 21))]
 
 
@@ -351,10 +362,10 @@ LAB: dict[str, Make] = {
         edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
         edge("p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}),
     ],
-    "only the first decays: {} rad at 38 s": lambda: seen(
+    "only the first decays: {} rad at 38 s": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, "")
     ),
-    "against {} rad at a constant 200 ms": lambda: seen(
+    "against {} rad at a constant 200 ms": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, ""), **CONSTANT
     ),
     "the age in use is {} ms on average": lambda: [age()],
@@ -370,28 +381,30 @@ LAB: dict[str, Make] = {
     "V falls from {} to {} J": lambda: lyapunov().V[[0, -1]],
     "With ones it rises by {} of {} J": lambda: rise(lyapunov(ones=True).V),
     "ones still fail, by {} J": lambda: rise(lyapunov(True, **EQUAL_KD).V)[:1],
-    "At 20 ms one hit, then {} N.": lambda: seen(
+    "At 20 ms one hit, then {} N.": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), link__delay_ms=20.0
     ),
-    "{} +- {} N, peaks of {} N": lambda: seen(
+    "{} +- {} N, peaks of {} N": lambda: measure_windows(
         "contact", "wall_mean_n wall_deviation_n wall_peak_n", (9, 15, "s")
     ),
-    "A fifth of the force settles at {} N": lambda: seen(
+    "A fifth of the force settles at {} N": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), sites__m__control__k_f=0.2
     ),
-    "integrate it: {} N at 6 s, {} N at 10 s, {} N at 20 s, {} N at 59 s": lambda: seen(
-        "windup", "wall_mean_n", *[(t - 0.1, t + 0.1, "s") for t in (6, 10, 20, 59)]
+    "integrate it: {} N at 6 s, {} N at 10 s, {} N at 20 s, {} N at 59 s": lambda: (
+        measure_windows(
+            "windup", "wall_mean_n", *[(t - 0.1, t + 0.1, "s") for t in (6, 10, 20, 59)]
+        )
     ),
-    "With gravity known it stays at {} N": lambda: seen(
+    "With gravity known it stays at {} N": lambda: measure_windows(
         "windup", "wall_mean_n", (58.9, 59.1, "s"), control__Gamma=[1.0, 1.0, 1.0, 0.0, 0.0]
     ),
     "feels 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[0], 5 * p[2] / p[0]],
     "trainee 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[1], 5 * p[2] / p[1]],
     "torques with it: {} rad/s and {} N m, where {} N m": lambda: [
-        *seen("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
-        *seen("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
+        *measure_windows("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
+        *measure_windows("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
     ],
-    "smoothly takes {} N m": lambda: seen(
+    "smoothly takes {} N m": lambda: measure_windows(
         "outage", "torque_peak_nm", (6, 15, "s"), on_stale__action="hold"
     ),
     "from the link, {} and {} J at 6.2 s": energy_of_healing,
@@ -506,20 +519,22 @@ ROWS = [
 ]
 
 
-def numbers(words: str, text: str) -> list[str]:
-    """The numbers in the one place of a text that has these words."""
-    pattern = NUMBER.join(map(re.escape, words.split("{}")))
-    found = re.findall(pattern, " ".join(text.split()))
-    assert len(found) == 1, f"{len(found)} places"
-    return [found[0]] if isinstance(found[0], str) else list(found[0])
+def numbers(phrase: str, text: str) -> list[str]:
+    """Returns the numbers in the single place of a text that has these words."""
+    pattern = NUMBER.join(map(re.escape, phrase.split("{}")))
+    matches = re.findall(pattern, " ".join(text.split()))
+    assert len(matches) == 1, f"{len(matches)} places"
+    return [matches[0]] if isinstance(matches[0], str) else list(matches[0])
 
 
-def check(page: str, words: str, made: Numbers | str) -> None:
+def check(page: str, phrase: str, source: Numbers | str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     for word, plain in WORDS.items():
         text = text.replace(word, plain)
-    wanted = list(map(float, numbers(words, made))) if isinstance(made, str) else list(made)
-    printed = numbers(words, text)
+    wanted = (
+        list(map(float, numbers(phrase, source))) if isinstance(source, str) else list(source)
+    )
+    printed = numbers(phrase, text)
     digits = [
         10.0 ** (int(e or 0) - len(m.partition(".")[2]))
         for m, _, e in (p.partition("e") for p in printed)
@@ -531,13 +546,13 @@ def check(page: str, words: str, made: Numbers | str) -> None:
     assert not any(off), f"{printed} on the page, made: {wanted}"
 
 
-@pytest.mark.parametrize(("page", "words", "make"), ROWS)
-def test_a_number_on_a_page_is_what_is_made(page: str, words: str, make: Make) -> None:
-    check(page, words, make())
+@pytest.mark.parametrize(("page", "phrase", "make"), ROWS)
+def test_page_numbers_equal_their_source(page: str, phrase: str, make: Make) -> None:
+    check(page, phrase, make())
 
 
 @pytest.mark.long
-def test_the_example_of_a_certificate_is_what_is_printed(tmp_path: Path) -> None:
+def test_the_printed_certificate_is_the_example(tmp_path: Path) -> None:
     for words in CERTIFIED:
         check("docs/logs/certificate.md", words, certified(tmp_path))
 
@@ -562,17 +577,19 @@ def tuned(duration_s: float, changes: Changes) -> CandidateScore:
 
 
 def test_the_table_of_tuned_gains_has_every_range() -> None:
-    made = [
+    rows = [
         [law, one.name, f"{one.low:g}", f"{one.high:g}", one.unit or "-", one.where or "all"]
         for law, space in SEARCH_SPACES.items()
         for one in space.knobs
     ]
-    assert [row[:6] for row in read_table("tuned-gains.csv")] == made
+    assert [row[:6] for row in read_table("tuned-gains.csv")] == rows
 
 
 @pytest.mark.parametrize("row", ENDS)
-def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
-    """Of the tables of docs/theory/fair-comparison-results.md with gains: four of the error, then four of settling."""
+def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
+    """For the rows with gains in docs/theory/fair-comparison-results.md: four of the error,
+    then four of settling.
+    """
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
     (space,) = select_search_spaces([law], load_scenario("free"))
@@ -580,31 +597,31 @@ def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
         name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
     }
     controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
-    made = tuned(
+    scores = tuned(
         30.0 if row < 4 else 6.0,
         {f"sites.{name}.control": table for name, table in controls.items()},
     )
     digit = 10.0 ** -len(reached.partition(".")[2])
-    assert (made.error_rad if row < 4 else made.settled_s) == pytest.approx(
+    assert (scores.error_rad if row < 4 else scores.settled_s) == pytest.approx(
         float(reached), abs=0.6 * digit
     )
-    assert made.effort_nm == pytest.approx(float(effort_nm), abs=0.006)
-    assert made.outcome == "settled"
+    assert scores.effort_nm == pytest.approx(float(effort_nm), abs=0.006)
+    assert scores.outcome == "settled"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("told", AS_PRINTED)
-def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
-    made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
+@pytest.mark.parametrize("statement", AS_PRINTED)
+def test_printed_gains_repeat_the_page(statement: str) -> None:
+    score = tuned(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
     check(
         "docs/theory/fair-comparison-results.md",
-        f"| as printed{told} | {{}} | {{}} |",
-        [made.error_rad, made.effort_nm],
+        f"| as printed{statement} | {{}} | {{}} |",
+        [score.error_rad, score.effort_nm],
     )
 
 
 def read_table(name: str) -> list[list[str]]:
-    """The rows of a table of docs/data, without its head."""
+    """Returns the rows of a table of docs/data, without its head."""
     with (ROOT / "docs" / "data" / name).open(newline="", encoding="utf-8") as stream:
         return list(csv.reader(stream))[1:]
 
@@ -619,32 +636,32 @@ def class_of(longest_s: float, **changes: Any) -> CellClass:
 
 @pytest.mark.long
 @pytest.mark.parametrize("row", range(19))
-def test_an_edge_of_p_d_lies_between_two_runs(row: int) -> None:
-    """Of the table of edges of docs/maps/README.md: unstable below, stable above."""
+def test_p_d_edges_lie_between_two_runs(row: int) -> None:
+    """The table of edges of docs/maps/README.md: unstable below, stable above."""
     assert len(EDGES) == 19
     stiffness, delay_ms, _, low, high = map(float, EDGES[row][:5])
     soft, longest_s = (SOFT, 640.0) if stiffness == SOFT["control.K"] else ({}, 320.0)
-    given = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
-    assert class_of(longest_s, **given, control__d=low).stable is False
-    assert class_of(longest_s, **given, control__d=high).stable is True
+    changes = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
+    assert class_of(longest_s, **changes, control__d=low).stable is False
+    assert class_of(longest_s, **changes, control__d=high).stable is True
 
 
 @pytest.mark.parametrize("row", range(len(LIVE_CELLS)))
-def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
+def test_live_cells_have_their_class(row: int) -> None:
     number, delay_ms, d, virtual, live = LIVE_CELLS[row]
     assert virtual == live
     # 40 values of d each
     assert int(number) == 40 * (int(delay_ms) // 40) + round(10.0 * float(d)) - 1
-    found = class_of(
+    cell_class = class_of(
         160.0, link__delay_ms=float(delay_ms), control__d=float(d), duration_s=20.0
     )
-    assert found.value == virtual
+    assert cell_class.value == virtual
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
-def test_a_mode_that_hardly_takes_part_is_not_passed_over(delay_ms: float, d: float) -> None:
+def test_hardly_excited_modes_are_not_ignored(delay_ms: float, d: float) -> None:
     """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
     assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
-    found = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
-    assert found is CellClass.UNDECIDED
+    cell_class = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
+    assert cell_class is CellClass.UNDECIDED

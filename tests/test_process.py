@@ -23,7 +23,7 @@ from trilat_net.signals import ENDING_SIGNALS, Interrupt, hold_sigint
 from trilat_net.workers import worker_pool
 
 
-def test_a_signal_is_remembered_and_ends_nothing() -> None:
+def test_signals_are_remembered_and_end_nothing() -> None:
     with Interrupt() as interrupt:
         assert not interrupt.is_requested()
         os.kill(os.getpid(), signal.SIGTERM)
@@ -81,7 +81,7 @@ def test_long_work_is_broken_off_at_once() -> None:
     assert interrupt.is_requested()
 
 
-def test_a_signal_that_python_swallowed_breaks_off_at_the_end() -> None:
+def test_swallowed_signals_break_off_at_the_end() -> None:
     def work(interrupt: Interrupt) -> None:
         with interrupt.raising(), contextlib.suppress(KeyboardInterrupt):  # as in a `__del__`
             os.kill(os.getpid(), signal.SIGINT)
@@ -90,7 +90,7 @@ def test_a_signal_that_python_swallowed_breaks_off_at_the_end() -> None:
         work(interrupt)
 
 
-def test_a_block_without_a_signal_ends_as_any_other() -> None:
+def test_blocks_without_signals_end_normally() -> None:
     with Interrupt() as interrupt:
         with interrupt.raising():
             pass
@@ -100,7 +100,9 @@ def test_a_block_without_a_signal_ends_as_any_other() -> None:
 
 @pytest.fixture(autouse=True)
 def sigint() -> Iterator[None]:
-    """Python's own handler, however these tests were started: a shell's background job ignores SIGINT."""
+    """Installs Python's own handler, however these tests were started: a shell's background job
+    ignores SIGINT.
+    """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -110,7 +112,7 @@ def wait_for_ever() -> None:
     threading.Event().wait()
 
 
-def test_work_is_done_in_other_processes_that_ignore_ctrl_c() -> None:
+def test_workers_are_processes_ignoring_ctrl_c() -> None:
     with worker_pool(1) as pool:
         assert list(pool.map(int.bit_length, [1, 255])) == [1, 8]
         assert pool.submit(os.getpid).result() != os.getpid()
@@ -126,7 +128,7 @@ def interrupted(pids: list[int]) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_interrupt_ends_workers_in_middle_of_something_that_never_ends() -> None:
+def test_interrupts_end_endless_workers() -> None:
     pids: list[int] = []
     with pytest.raises(KeyboardInterrupt):
         interrupted(pids)
@@ -186,7 +188,7 @@ WINDOWS_WORDS = [
 ]
 
 
-def test_a_command_is_quoted_as_the_shell_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_are_quoted_for_the_shell(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shlex.split(join_arguments(WINDOWS_WORDS)) == WINDOWS_WORDS
     monkeypatch.setattr(errors, "os", replace_os())
     plain = r'trilat sweep "my runs\\one" "m1->s" "say \"no\"" C:\\runs --set a=-1.5'
@@ -197,10 +199,12 @@ class ProcessEndedError(Exception):
     """Stands for the end of a process."""
 
 
-def test_a_worker_ends_with_its_parent_as_on_windows(
+def test_workers_end_with_parents_as_on_windows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """There the number of a parent that has gone stays the same; a handle to it, here a pipe, tells."""
+    """On Windows the number of a dead parent stays the same; a handle to the parent, here a
+    pipe, shows its end.
+    """
     ended, alive = multiprocessing.Pipe()
     codes: list[int] = []
 
@@ -218,7 +222,7 @@ def test_a_worker_ends_with_its_parent_as_on_windows(
     assert codes == [1]
 
 
-def test_a_closed_window_is_a_signal_as_on_windows() -> None:
+def test_closed_windows_are_signals_as_on_windows() -> None:
     program = (
         "import signal\n"
         "signal.SIGBREAK = signal.SIGHUP\n"
@@ -232,19 +236,19 @@ def test_a_closed_window_is_a_signal_as_on_windows() -> None:
 @pytest.mark.skipif(
     not sys.platform.startswith("linux"), reason="threads have nice values on Linux alone"
 )
-def test_priority_rises_but_for_the_main_thread() -> None:
-    """Where it is not permitted nothing changes and nothing is said."""
+def test_priority_rises_except_in_the_main_thread() -> None:
+    """Without permission nothing changes and nothing is reported."""
     before = os.getpriority(os.PRIO_PROCESS, os.getpid())
-    found: list[tuple[bool, int]] = []
+    priorities: list[tuple[bool, int]] = []
 
     def work() -> None:
         raised = process.raise_priority(before - 1)
-        found.append((raised, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
+        priorities.append((raised, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert found in ([(True, before - 1)], [(False, before)])
+    assert priorities in ([(True, before - 1)], [(False, before)])
     assert os.getpriority(os.PRIO_PROCESS, os.getpid()) == before
 
 
@@ -252,7 +256,7 @@ def test_priority_rises_but_for_the_main_thread() -> None:
     not Path("/proc/self/autogroup").exists(), reason="this system has no groups of sessions"
 )
 @pytest.mark.parametrize("leads", [True, False])
-def test_priority_counts_among_sessions_for_their_leader_alone(leads: bool) -> None:
+def test_session_priority_counts_for_the_leader_alone(leads: bool) -> None:
     program = (
         "from pathlib import Path\n"
         "from trilat_net.process import raise_priority\n"

@@ -1,4 +1,4 @@
-"""What a push leaves to the long tests: only what is dear, never a whole file, and nothing that is gone."""
+"""The tests that a push leaves to the long run: only dear ones, never a whole file, and no missing ones."""
 
 import re
 from pathlib import Path
@@ -8,17 +8,17 @@ from .push_set import DEAR_S, MOST_S, ROOT, choose_long_tests, read_long_tests
 FILE = "tests/cli/test_a.py"
 
 
-def test_of_every_file_the_cheapest_stays() -> None:
+def test_the_cheapest_test_of_every_file_stays() -> None:
     times_s = {f"{FILE}::test_{n}": MOST_S - 0.1 * n for n in range(9)}
     assert choose_long_tests(times_s) == [f"{FILE}::test_{n}" for n in range(8)]
 
 
-def test_whatever_takes_too_long_is_left() -> None:
+def test_slow_tests_are_left() -> None:
     dear, cheap = f"{FILE}::test_dear", f"{FILE}::test_cheap"
     assert choose_long_tests({dear: 1.01 * MOST_S, cheap: 0.5 * DEAR_S}) == [dear]
 
 
-def test_all_that_is_left_exists() -> None:
+def test_every_listed_test_exists() -> None:
     for name in read_long_tests():
         path, _, case = name.partition("::")
         text = Path(ROOT, path).read_text(encoding="utf-8")

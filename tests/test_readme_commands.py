@@ -17,7 +17,7 @@ from tests.readme_commands import (
 
 
 def list_commands() -> set[str]:
-    """All commands of the program, as in "log info"."""
+    """Returns all commands of the program, as in "log info"."""
     names = [name.removeprefix("trilat ") for name in all_options() if name != "trilat"]
     return {name for name in names if not any(other.startswith(f"{name} ") for other in names)}
 
@@ -32,11 +32,11 @@ def test_every_command_of_the_readme_is_run() -> None:
     assert list_unlike_commands() == []
 
 
-def test_the_readme_shows_the_judgement_of_its_first_run(tmp_path: Path) -> None:
-    (shown,) = (block.text for block in find_blocks("README.md") if not block.language)
+def test_the_readme_shows_its_first_judgement(tmp_path: Path) -> None:
+    (readme_output,) = (block.text for block in find_blocks("README.md") if not block.language)
     trilat("sim", "two_people", "-o", "run.mcap", cwd=tmp_path).succeeds()
     printed = trilat("certify", "run.mcap", cwd=tmp_path).succeeds().splitlines()
-    assert printed[0] == shown.strip()
+    assert printed[0] == readme_output.strip()
     assert len([line for line in printed if line.startswith(("ok ", "note "))]) == 9
     page = (ROOT / "docs/tutorials/first-result.md").read_text(encoding="utf-8")
     explained = re.findall(r"^\| `(.+?)` \|", page, re.MULTILINE)
@@ -58,13 +58,15 @@ def test_the_page_lists_nearly_every_command() -> None:
 def test_options_of_these_commands_exist() -> None:
     options = all_options()
     for command in list_all():
-        words = shlex.split(command)
-        if words[0] != "trilat":
+        arguments = shlex.split(command)
+        if arguments[0] != "trilat":
             continue
-        name = max((one for one in options if " ".join(words).startswith(one)), key=len)
+        name = max(
+            (option for option in options if " ".join(arguments).startswith(option)), key=len
+        )
         if name == "trilat set":
             continue  # the options of its commands follow their words
-        unknown = {word.partition("=")[0] for word in words if word.startswith("-")} - {
+        unknown = {word.partition("=")[0] for word in arguments if word.startswith("-")} - {
             *options[name]
         }
         assert not {word for word in unknown if not word.startswith("--no-")}, command

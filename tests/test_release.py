@@ -37,7 +37,7 @@ RELEASE: dict[Any, Any] = yaml.safe_load((ROOT / ".github/workflows/release.yml"
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_a_workflow_is_pinned_and_may_do_little(path: Path) -> None:
+def test_workflows_are_pinned_and_have_few_rights(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     used = re.findall(r"uses: (.+)$", text, re.MULTILINE)
     assert used
@@ -53,7 +53,7 @@ def test_a_workflow_is_pinned_and_may_do_little(path: Path) -> None:
     assert "secrets." not in text
 
 
-def test_workflows_install_by_hash_or_what_they_built() -> None:
+def test_workflows_install_by_hash_or_own_builds() -> None:
     """A package of somebody else could put its own files among those that are published."""
     installed = 0
     for path in WORKFLOWS:
@@ -76,7 +76,7 @@ def test_workflows_install_by_hash_or_what_they_built() -> None:
     assert installed >= 8
 
 
-def test_what_the_workflows_run_is_there() -> None:
+def test_commands_of_workflows_exist() -> None:
     for path in WORKFLOWS:
         for job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values():
             for line in (step["run"] for step in job["steps"] if "run" in step):
@@ -94,7 +94,7 @@ def test_what_the_workflows_run_is_there() -> None:
                     ), line
 
 
-def test_a_release_is_built_once_and_published_without_a_secret() -> None:
+def test_releases_are_built_once_without_a_secret() -> None:
     jobs = RELEASE["jobs"]
     assert RELEASE[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` so
     needs = {"build": None, "compile": "build", "install": "compile", "studies": "build"}
@@ -119,7 +119,7 @@ def locked(name: str) -> set[str]:
     return set(re.findall(r"^([\w-]+)==", text, re.MULTILINE))
 
 
-def test_every_lock_has_what_is_stated_for_it() -> None:
+def test_locks_have_their_stated_contents() -> None:
     """A lock that is made once and not again with a new dependency lacks it: `make lock`."""
     groups = {key: names_of(stated) for key, stated in PROJECT["dependency-groups"].items()}
     needed, extras = (
@@ -143,7 +143,7 @@ def check_release(tag: str, folder: Path) -> "subprocess.CompletedProcess[str]":
     )
 
 
-def test_a_tag_that_is_not_the_version_is_refused(tmp_path: Path) -> None:
+def test_tags_must_equal_the_version(tmp_path: Path) -> None:
     for name in ("pyproject.toml", "CITATION.cff"):
         shutil.copy(ROOT / name, tmp_path)
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
@@ -190,7 +190,7 @@ def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return made
 
 
-def test_both_distributions_are_one_program_of_one_version(sources: Path) -> None:
+def test_both_distributions_are_one_program(sources: Path) -> None:
     """One has every file, the other the remaining libraries; nothing is installed twice."""
     core, whole = (
         tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))[
@@ -217,7 +217,7 @@ def test_both_distributions_are_one_program_of_one_version(sources: Path) -> Non
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_a_package_has_the_version_and_bounds_of_the_program(name: str, sources: Path) -> None:
+def test_packages_have_the_programs_version_bounds(name: str, sources: Path) -> None:
     released = tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))
     first, *libraries = released["project"]["dependencies"]
     assert (released["project"]["version"], first) == (VERSION, f"{CORE}=={VERSION}")
@@ -312,7 +312,7 @@ MISSING = {
 
 
 @pytest.mark.long
-def test_packages_and_those_of_others_join_the_core(
+def test_own_and_foreign_packages_join_the_core(
     built: dict[str, list[Path]], tmp_path: Path
 ) -> None:
     """The core imports none of them, and says what to install; with them it has their commands and functions."""
@@ -375,7 +375,7 @@ def test_the_packagers_find_nothing(built: dict[str, list[Path]]) -> None:
     run(tools["twine"], "check", "--strict", *built[CORE], *built[WHOLE], cwd=ROOT)
 
 
-def test_to_import_the_package_imports_none_of_what_takes_time() -> None:
+def test_importing_the_package_imports_nothing_slow() -> None:
     """The bar is 30 ms: what it imports beyond an interpreter's start are a few modules of the library."""
     code = "import sys; before = set(sys.modules); import trilat_net; print(*(set(sys.modules) - before))"
     made = subprocess.run(

@@ -1,4 +1,6 @@
-"""The site of documentation: links and pictures hold, it has every name, and takes nothing from a network."""
+"""The site of documentation: links and pictures work, every name is present, and nothing is
+loaded from a network.
+"""
 
 import re
 import runpy
@@ -24,7 +26,7 @@ MAKE = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "site" / "make_pages
 
 
 class Page(HTMLParser):
-    """What a page's parts are called, where it leads to, and what a browser loads for it."""
+    """The parts of a page, its links, and the files that a browser loads for the page."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -34,22 +36,24 @@ class Page(HTMLParser):
         self.feed(page.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {key: value for key, value in attrs if value}
-        self.ids |= {given[key] for key in ("id",) if key in given}
-        self.leads |= {given["href"]} if tag == "a" and "href" in given else set()
-        self.loads |= {given[key] for key in ("src", "href") if tag != "a" and key in given}
+        attributes = {key: value for key, value in attrs if value}
+        self.ids |= {attributes[key] for key in ("id",) if key in attributes}
+        self.leads |= {attributes["href"]} if tag == "a" and "href" in attributes else set()
+        self.loads |= {
+            attributes[key] for key in ("src", "href") if tag != "a" and key in attributes
+        }
 
 
-def test_every_picture_and_page_that_first_page_names_is_there() -> None:
+def test_the_first_pages_links_exist() -> None:
     overview = (ROOT / "docs" / "overview.md").read_text(encoding="utf-8")
     text = MAKE.read_beside_docs("README.md") + overview.replace("](../", "](")
     named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
     assert len(named) > 60
-    places = [ROOT / "docs" / one for one in named if one not in MAKE.BESIDE]
-    assert [place for place in places if not place.is_file()] == []
+    places = [ROOT / "docs" / name for name in named if name not in MAKE.BESIDE]
+    assert [missing for missing in places if not missing.is_file()] == []
 
 
-def test_the_menu_has_nine_entries_at_most_and_every_page_once() -> None:
+def test_the_menu_has_nine_entries_at_most() -> None:
     settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
     entries = settings["project"]["nav"]
     assert len(entries) <= 9
@@ -57,12 +61,14 @@ def test_the_menu_has_nine_entries_at_most_and_every_page_once() -> None:
     assert len(named) == len(set(named))
     docs = ROOT / "docs"
     pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
-    made = {"index.md", "SECURITY.md", "CHANGELOG.md", "LICENSE.md"}
-    made |= {f"reference/{name}.md" for name in ("commands", "python", "scenario", "scenarios")}
-    assert pages | made == set(named)
+    pages_in_menu = {"index.md", "SECURITY.md", "CHANGELOG.md", "LICENSE.md"}
+    pages_in_menu |= {
+        f"reference/{name}.md" for name in ("commands", "python", "scenario", "scenarios")
+    }
+    assert pages | pages_in_menu == set(named)
 
 
-def test_a_page_is_found_by_its_name_and_lies_in_the_folder_of_its_menu() -> None:
+def test_pages_are_found_in_their_menus_folder() -> None:
     settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
     names: list[str] = []
     for entry in settings["project"]["nav"]:
@@ -81,12 +87,12 @@ def test_pages_are_short() -> None:
     """
     pages = list((ROOT / "docs").rglob("*.md"))
     formula = re.compile(r"```math\n.*?```|\$`[^`]+`\$", re.DOTALL)
-    words = [
+    counts = [
         len(formula.sub("formula", page.read_text(encoding="utf-8")).split()) for page in pages
     ]
-    assert sum(words) <= 72_000
-    assert statistics.median(words) <= 1_200
-    assert max(words) <= 2_500
+    assert sum(counts) <= 72_000
+    assert statistics.median(counts) <= 1_200
+    assert max(counts) <= 2_500
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1_100
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split()) <= 1_500
 
@@ -100,7 +106,9 @@ def test_the_list_of_scenarios_begins_with_the_paper() -> None:
 @pytest.mark.long
 @needs_browser
 def test_the_site_is_whole() -> None:
-    """Zensical refuses a Markdown link or an anchor that leads nowhere; pictures in HTML it does not see."""
+    """Zensical refuses a Markdown link or an anchor that leads nowhere, but does not check
+    pictures in HTML.
+    """
     subprocess.run(
         [sys.executable, "docs/site/make_pages.py", "--no-pictures"], cwd=ROOT, check=True
     )
@@ -120,24 +128,30 @@ def test_the_site_is_whole() -> None:
     absent, foreign = [], []
     for path in HTML.rglob("*.html"):
         page = Page(path)
-        foreign += [(path.name, one) for one in page.loads if urlsplit(one).netloc]
-        for one in map(urlsplit, page.leads | page.loads):
-            if not (one.scheme or one.netloc) and one.path and path.name != "404.html":
-                target = path.parent / unquote(one.path)
-                absent += [(path.name, one.path)] if not target.exists() else []
+        foreign += [(path.name, address) for address in page.loads if urlsplit(address).netloc]
+        for address in map(urlsplit, page.leads | page.loads):
+            if (
+                not (address.scheme or address.netloc)
+                and address.path
+                and path.name != "404.html"
+            ):
+                target = path.parent / unquote(address.path)
+                absent += [(path.name, address.path)] if not target.exists() else []
     assert absent == []
     assert foreign == []
     check_search()
 
 
 def check_search() -> None:
-    """From a page in a folder, opened as a file: what is found leads to its place, and nothing is fetched."""
+    """Searches from a page in a folder, opened as a file: each result leads to its place, and
+    nothing is fetched.
+    """
     with browser_page("about:blank") as page:
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
+        requests: list[str] = []
+        page.on("request", lambda request: requests.append(request.url))
         page.goto((HTML / "maps" / "index.html").as_uri())
         page.locator(".md-search__button").first.click()
         page.locator("dialog input").first.fill("dominance")
         page.locator("dialog a", has_text="trilat set dominance").first.click()
         page.wait_for_url("**/reference/commands.html*#trilat-set-dominance")
-        assert {urlsplit(url).scheme for url in asked} <= {"file", "data", "blob"}
+        assert {urlsplit(url).scheme for url in requests} <= {"file", "data", "blob"}

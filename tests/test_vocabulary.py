@@ -50,17 +50,17 @@ def _words(name: str) -> set[str]:
 
 
 def _names() -> list[str]:
-    """Of modules, classes and public functions."""
+    """Yields the names of modules, classes and public functions."""
     names = chain.from_iterable([path.stem, *house.definitions(path)] for path in house.files())
     return [name for name in names if not name.rpartition(".")[2].startswith("_")]
 
 
-def test_word_has_one_meaning_and_there_are_sixty_at_most() -> None:
-    words = [word for cell, _ in USED for word in cell.split(", ")]
-    assert 30 < len(words) == len(set(words)) <= 60
+def test_at_most_sixty_words_have_one_meaning() -> None:
+    terms = [word for cell, _ in USED for word in cell.split(", ")]
+    assert 30 < len(terms) == len(set(terms)) <= 60
 
 
 @pytest.mark.parametrize("cell", UNUSED)
-def test_no_name_has_a_word_that_is_not_used(cell: str) -> None:
+def test_no_name_has_an_unused_word(cell: str) -> None:
     banned = {word for word in cell.split(", ") if " " not in word}
     assert not [name for name in _names() if _words(name) & banned]

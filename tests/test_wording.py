@@ -75,14 +75,18 @@ def find_bare_plurals(path: Path) -> Iterator[str]:
                 continue
             if value.format_spec is not None:
                 continue  # a measured number, as in "2.5 stretches"
-            shown = ast.unparse(value.value)
-            if (found := pattern.match(str(text.value))) and not NOT_A_COUNT.search(shown):
-                yield f"{path}:{node.lineno}: {{{shown}}} {found[1]}"
+            source = ast.unparse(value.value)
+            if (match := pattern.match(str(text.value))) and not NOT_A_COUNT.search(source):
+                yield f"{path}:{node.lineno}: {{{source}}} {match[1]}"
 
 
 def test_no_text_counts_by_a_bare_plural() -> None:
-    found = [place for path in house.files() for place in find_bare_plurals(path)]
-    assert not found, "\n".join(["use count_nouns of trilat_net/errors.py:", *found])
+    bare_plurals = [
+        bare_plural for path in house.files() for bare_plural in find_bare_plurals(path)
+    ]
+    assert not bare_plurals, "\n".join(
+        ["use count_nouns of trilat_net/errors.py:", *bare_plurals]
+    )
 
 
 PRINT_ONE_LINE = {

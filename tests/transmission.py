@@ -64,22 +64,22 @@ def balance(
     `held_s`: for so long a torque of the law is held, which delays it by half of that.
     """
     n = len(alpha)
-    one, late = np.eye(n), alpha * np.exp(-s * delay_s)
+    identity, late = np.eye(n), alpha * np.exp(-s * delay_s)
     held = (1.0 - np.exp(-s * held_s)) / (s * held_s) if held_s else 1.0
     peer, own = (np.diag(np.broadcast_to(gain, n)) for gain in (force_peer, force_own))
     impedance = np.diag([K_h + B_h * s for K_h, B_h in [*loads, *[(0.0, 0.0)] * n][:n]])
     # s^2 x = held tau + f and (1 - c_a late) tau = -(K + B s)(1 - late) x + felt f, f: the torque on the arm,
     # tau + f being what is sent as qdd
-    slow = (one - acceleration * late) / held
-    felt = own + (peer + acceleration * one) @ late
+    slow = (identity - acceleration * late) / held
+    felt = own + (peer + acceleration * identity) @ late
     b = slow + felt
-    return slow * s**2 + (K + B * s) * (one - late) + b @ impedance, b
+    return slow * s**2 + (K + B * s) * (identity - late) + b @ impedance, b
 
 
 def transmitted(
     frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object
 ) -> float:
-    """|torque / velocity| that a torque on arm `at` meets, over |Z_e| of the wall at the last arm."""
+    """Returns |torque / velocity| for a torque on arm `at`, over |Z_e| of the wall at the last arm."""
     s = 2j * np.pi * frequency_hz
     free = [(0.0, 0.0)] * (len(alpha) - 1)
     A, b = balance(s, alpha, loads=[*free, WALL], **law)  # type: ignore[arg-type]
@@ -90,7 +90,9 @@ def transmitted(
 def rightmost_root(
     alpha: NDArray[np.float64], loads: Sequence[tuple[float, float]], **law: object
 ) -> float:
-    """The largest real part of the roots without delay, from det A(s), a polynomial of degree 2 n."""
+    """Returns the largest real part of the roots without delay, from det A(s), a polynomial of
+    degree 2 n.
+    """
     degree = 2 * len(alpha)
     points = 10.0 * np.exp(2j * np.pi * np.arange(degree + 1) / (degree + 1))
     values = [np.linalg.det(balance(s, alpha, loads=loads, **law)[0]) for s in points]  # type: ignore[arg-type]
@@ -98,6 +100,6 @@ def rightmost_root(
     return float(10.0 * np.roots(scaled[::-1]).real.max())
 
 
-def printed(value: float) -> Any:
-    """A printed number: within half of its last digit, of three."""
+def approximate_printed(value: float) -> Any:
+    """Returns an approximation of a printed number of three digits, within half of the last digit."""
     return pytest.approx(value, rel=2e-3, abs=6e-4)

@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 
 @dataclass
 class Member:
-    """A member's clock: what it reads is start + offset + (true - start) (1 + drift)."""
+    """A member's clock, whose reading is start + offset + (true - start) (1 + drift)."""
 
     epoch_ns: int
     start_ns: int
@@ -36,17 +36,17 @@ class Member:
         return self.start_ns + round(passed_ns / self.rate)
 
     def reading_ns(self, true_ns: int) -> int:
-        """Returns what it reads at an instant of the clock underneath."""
+        """Returns the reading of the clock at an instant of the clock underneath."""
         return self.start_ns + self.offset_ns + round((true_ns - self.start_ns) * self.rate)
 
     def offset_to_ns(self, other: "Member", since_epoch_ns: int) -> int:
-        """Returns how far another clock is ahead of this one at a reading of this one since the epoch."""
+        """Returns the lead of another clock over this one at a reading of this one since the epoch."""
         true_ns = self.true_ns(since_epoch_ns)
         return other.reading_ns(true_ns) - self.reading_ns(true_ns)
 
 
 def members(log: Log) -> dict[str, Member]:
-    """The clocks of a log's members."""
+    """Returns the clocks of a log's members."""
     started = next(event for event in log.events if event.kind == "start")
     announced = next(
         e for e in log.events if e.kind == "epoch" and e.attempt == started.attempt
@@ -62,7 +62,7 @@ def members(log: Log) -> dict[str, Member]:
 
 
 def again(log: Log, name: str) -> Member:
-    """The clock of the last start of a member that joined the running session."""
+    """Returns the clock of the last start of a member that joined the running session."""
     event = [e for e in log.events if e.kind == "coming" and e.member == name][-1]
     skew = SKEWED.search(event.clock)
     offset_ns, drift_ppb, start_ns = map(int, skew.groups()) if skew else (0, 0, 0)
@@ -92,7 +92,7 @@ class Judged:
 
 
 class Bound:
-    """What a site's log says of the clock of one peer over time."""
+    """The logged bounds of a site on the clock of one peer over time."""
 
     def __init__(self, log: Log, site: str, peer: str) -> None:
         self.events: list[Event] = [
@@ -101,28 +101,28 @@ class Bound:
         self._ticks = [event.ticks for event in self.events]
 
     def at(self, tick: int, t_ns: int) -> float | None:
-        """The bound of an offset at a tick, us; None before the first that was logged."""
-        place = bisect_right(self._ticks, tick) - 1
-        if place < 0:
+        """Returns the bound of an offset at a tick, us; None before the first that was logged."""
+        index = bisect_right(self._ticks, tick) - 1
+        if index < 0:
             return None
-        event = self.events[place]
+        event = self.events[index]
         later_ns = max(0, t_ns - event.t_ns - SLEW_NS)
         return (event.bound_ns + later_ns * event.drift_bound_ppb / NS_PER_S) / 1000
 
 
-def judged(log: Log, site: str, peer: str) -> Judged:
-    """Every sample of a link that its receiver echoed, against the truth."""
+def judge_link(log: Log, site: str, peer: str) -> Judged:
+    """Returns every sample of a link that its receiver echoed, against the truth."""
     clocks = members(log)
-    place = log.scenario.peers(site).index(peer)
+    peer_index = log.scenario.peers(site).index(peer)
     sent = {state.tick: state.sent_ns for state in log[peer].states}
     bound = Bound(log, site, peer)
     shared = clocks[site] == clocks[peer]
     rows = []
     for state in log[site].states:
-        logged = {tick: delay_us for index, tick, delay_us in state.rx if index == place}
+        logged = {tick: delay_us for index, tick, delay_us in state.rx if index == peer_index}
         for index, tick, arrived_ns in state.echo:
             limit_us = 0.0 if shared else bound.at(state.tick, state.t_ns)
-            if index == place and limit_us is not None:
+            if index == peer_index and limit_us is not None:
                 true_ns = clocks[site].true_ns(arrived_ns) - clocks[peer].true_ns(sent[tick])
                 rows.append(
                     (state.tick, true_ns / 1000, logged[tick] - true_ns / 1000, limit_us)
@@ -132,13 +132,15 @@ def judged(log: Log, site: str, peer: str) -> Judged:
 
 
 def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
-    """Every logged estimate against the truth: t (s), error of the offset (us) and of the drift (ppm)."""
+    """Returns every logged estimate against the truth: t (s), error of the offset (us) and of
+    the drift (ppm).
+    """
     clocks = members(log)
-    own, other = clocks[site], clocks[peer]
-    drift_ppm = float(other.rate / own.rate - 1) * 1e6
+    own_clock, other = clocks[site], clocks[peer]
+    drift_ppm = float(other.rate / own_clock.rate - 1) * 1e6
     rows = []
     for event in Bound(log, site, peer).events:
-        offset_ns = own.offset_to_ns(other, event.t_ns)
+        offset_ns = own_clock.offset_to_ns(other, event.t_ns)
         rows.append(
             (
                 event.t_ns / NS_PER_S,

@@ -32,7 +32,9 @@ ALLOWED = 1.5
 
 
 class Motion(NamedTuple):
-    """What turns: the shared orientations of a site and of its reference, and the joints of its arm, rad."""
+    """The rotating bodies: the shared orientations of a site and of its reference, and the
+    joints of its arm, rad.
+    """
 
     turned: Rotation
     reference: Rotation
@@ -40,7 +42,9 @@ class Motion(NamedTuple):
 
 
 def turn(number: int, records: int = RECORDS) -> Rotation:
-    """A tool that points down, half turns about every axis, or several turns about an axis that moves."""
+    """Returns a tool that points down, half turns about every axis, or several turns about an
+    axis that moves.
+    """
     random = np.random.default_rng(number)
     s = np.linspace(0.0, 1.0, records)[:, np.newaxis]
     axis = np.array(AXES[number // 3 % len(AXES)], dtype=np.float64)
@@ -56,7 +60,7 @@ def turn(number: int, records: int = RECORDS) -> Rotation:
 
 
 def move(number: int, site: str, start: Array, records: int = RECORDS) -> Motion:
-    """The motion of one site; sites move alike, one later than the other."""
+    """Returns the motion of one site; sites move alike, one later than the other."""
     random = np.random.default_rng([number, *map(ord, site)])
     s = np.linspace(0.0, 1.0, records)[:, np.newaxis]
     reach = random.uniform(-2.5, 2.5, len(start)) * np.pi
@@ -68,18 +72,18 @@ def move(number: int, site: str, start: Array, records: int = RECORDS) -> Motion
 
 
 def count_wraps(turned: Rotation) -> int:
-    """How often the rotation vectors, at most half a turn long, jump."""
+    """Counts the jumps of the rotation vectors, which are at most half a turn long."""
     steps = np.linalg.norm(np.diff(turned.as_rotvec(), axis=0), axis=1)
     return int(np.count_nonzero(steps > np.pi))
 
 
 def largest_step(turned: Rotation) -> float:
-    """The largest angle from one orientation to the next, rad."""
+    """Returns the largest angle from one orientation to the next, rad."""
     return float((turned[1:] * turned[:-1].inv()).magnitude().max())
 
 
 def place_links(scenario: Scenario, site: str, q: Array) -> list[Rotation]:
-    """The orientations of the links of an arm in its base."""
+    """Returns the orientations of the links of an arm in its base."""
     chain = scenario.arms[site].chain
     assert chain is not None
     links, whole = list[Rotation](), Rotation.identity()
@@ -106,20 +110,21 @@ def _simulate() -> bytes:
 
 
 def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
-    """A log of two arms whose records have one of the motions, and the motions by site."""
+    """Returns a log of two arms whose records have one of the motions, and the motions by site."""
     scenario = load_case()
     motions = {
         site: move(number, site, np.array(scenario.sites[site].q0_rad))
         for site in scenario.names
     }
     vectors = {
-        site: [one.as_rotvec() for one in motion[:2]] for site, motion in motions.items()
+        site: [rotation.as_rotvec() for rotation in motion[:2]]
+        for site, motion in motions.items()
     }
 
-    def record(found: Record) -> Record:
-        site, k = found["site"], min(found["tick"], RECORDS - 1)
+    def record(fields: Record) -> Record:
+        site, k = fields["site"], min(fields["tick"], RECORDS - 1)
         for field, vector in zip(("x", "q_des"), vectors[site], strict=True):
-            found[field] = [*found[field][:3], *vector[k].tolist()]
-        return {**found, "q": motions[site].q[k].tolist()}
+            fields[field] = [*fields[field][:3], *vector[k].tolist()]
+        return {**fields, "q": motions[site].q[k].tolist()}
 
     return opened(edited(_simulate(), record=record)), motions

@@ -9,8 +9,8 @@ from typing import Any
 
 from tests.transmission import VARIANTS
 from tests.virtual_runs import Array, sampled
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.code_consent import allow_own_code
 
 ARM = {
     "l1_m": 1.0,
@@ -35,7 +35,7 @@ CLAMP = {
 def hand(
     to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: float = 1.0
 ) -> dict[str, Any]:
-    """A spring hand that goes to x = `to` in two seconds."""
+    """Returns a spring hand that goes to x = `to` in two seconds."""
     gains = {"stiffness_nm_rad": stiffness, "damping_nm_s_rad": damping}
     return {
         "kind": "spring",
@@ -59,7 +59,7 @@ DRIVE = {
 
 def _toml(value: Any) -> str:
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f'"{key}" = {_toml(one)}' for key, one in value.items()) + "}"
+        return "{" + ", ".join(f'"{key}" = {_toml(item)}' for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml, value))}]"
     return str(value).lower() if isinstance(value, bool) else repr(value)
@@ -68,7 +68,8 @@ def _toml(value: Any) -> str:
 def unit_text(
     sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
 ) -> str:
-    """Sites with unit arms, the last one a slave; two follow each other, more share as `dominance` says.
+    """Returns sites with unit arms, the last one a slave; two follow each other, more share as
+    `dominance` says.
 
     `more` are keys of the scenario; links have 200 ms unless `link` says otherwise.
     """
@@ -96,12 +97,12 @@ def unit_text(
 def unit_scenario(
     sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
 ) -> Scenario:
-    """The scenario of `unit_text`."""
+    """Returns the scenario of `unit_text`."""
     return allow_own_code(parse_scenario(unit_text(sites, control, **more), "unit"))
 
 
 def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
-    """Per time the records before it, of a compiled run: by field shape (N, 2)."""
+    """Returns, per time, the records before it, of a compiled run: by field shape (N, 2)."""
     rows = sampled(scenario, times_s)
     columns = next(iter(scenario.names))
     fields = scenario.layout(columns).columns()
@@ -109,7 +110,9 @@ def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
 
 
 def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any) -> Scenario:
-    """A driven master and a slave at a wall, `delay_s` apart, under a variant of the four-channel law."""
+    """Returns a driven master and a slave at a wall, `delay_s` apart, under a variant of the
+    four-channel law.
+    """
 
     def one(at: int) -> dict[str, Any]:
         law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}

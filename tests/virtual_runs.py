@@ -40,7 +40,7 @@ class Run:
     sites: dict[str, Trajectory]
 
     def stack(self, field: str) -> Array:
-        """The field of every site, shape (N, K, ...)."""
+        """Returns the field of every site, shape (N, K, ...)."""
         return np.array([getattr(site, field) for site in self.sites.values()])
 
 
@@ -74,12 +74,14 @@ def trajectories(scenario: Scenario) -> Run:
 
 
 def sampled(scenario: Scenario, times_s: Array | tuple[float, ...]) -> Array:
-    """The last records before some times, shape (N, K, 17), of a compiled run: quick where few are asked."""
-    made = FusedRun(scenario)
+    """Returns the last records before some times, shape (N, K, 17), of a compiled run: quick
+    for few times.
+    """
+    fused_run = FusedRun(scenario)
     rows = []
     for t_s in times_s:
-        made.advance_to(float(t_s))
-        rows.append(made.records)
+        fused_run.advance_to(float(t_s))
+        rows.append(fused_run.records)
     return np.stack(rows, axis=1)
 
 
@@ -89,7 +91,7 @@ def _run(name: str, overrides: tuple[tuple[str, Any], ...]) -> Run:
 
 
 def run(name: str, overrides: Mapping[str, Any] | None = None) -> Run:
-    """A shipped scenario in virtual time; the same call returns the same run."""
+    """Returns a shipped scenario in virtual time; the same call returns the same run."""
     return _run(name, tuple(sorted((overrides or {}).items())))
 
 

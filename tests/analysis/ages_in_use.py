@@ -1,4 +1,6 @@
-"""The age of the sample in use where delays are independent, by sums of products of their distribution."""
+"""Mean and deviation of the age of the sample in use for independent delays, by sums of
+products of their distribution.
+"""
 
 import math
 
@@ -6,19 +8,23 @@ import numpy as np
 
 
 def newest_wins(cdf, h_ms):
-    """Mean and deviation of the age in use: it exceeds n h where none of the last n samples is there yet."""
+    """Returns mean and deviation of the age in use: the age exceeds n h if none of the last n
+    samples has arrived yet.
+    """
     none_yet = np.cumprod(1.0 - cdf(h_ms * np.arange(1, 20_000)))
     return moments(np.concatenate([[1.0], none_yet]), h_ms)
 
 
 def in_order(cdf, h_ms):
-    """The same where none overtakes: it exceeds n h unless the n-th sample back and all older are there."""
+    """Returns the same for links that keep the order: the age exceeds n h unless the n-th
+    sample back and all older ones have arrived.
+    """
     all_there = np.cumprod(cdf(h_ms * np.arange(1, 20_000))[::-1])[::-1]
     return moments(np.concatenate([[1.0], 1.0 - all_there]), h_ms)
 
 
 def moments(exceeds, h_ms):
-    """Mean and deviation of n h, n >= 1, from the probabilities of n > 0, 1, 2..."""
+    """Returns mean and deviation of n h, n >= 1, from the probabilities of n > 0, 1, 2..."""
     n = np.arange(len(exceeds))
     mean = h_ms * exceeds.sum()
     return mean, math.sqrt(h_ms**2 * ((2 * n + 1) * exceeds).sum() - mean**2)

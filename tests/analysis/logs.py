@@ -1,4 +1,4 @@
-"""Logs of every kind that a report must stand: few sites, many, nobody's hands, torn, short, late."""
+"""Logs of every kind that a report must support: few sites, many, no hands, torn, short, late."""
 
 import io
 from collections.abc import Callable, Collection, Sequence
@@ -131,7 +131,7 @@ ORDERED = {
 
 
 class Run(NamedTuple):
-    """A run that this module drove itself: its log, and what each site's links counted."""
+    """A run driven by this module: its log, and the counts of each site's links."""
 
     log: Log
     counts: dict[str, tuple[LinkCounts, ...]]
@@ -143,13 +143,15 @@ Sample = tuple[str, int, int]
 
 @cache
 def busy() -> Run:
-    return driven(parse_scenario(BUSY))
+    return drive_run(parse_scenario(BUSY))
 
 
-def driven(
+def drive_run(
     scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[Sample] = ()
 ) -> Run:
-    """A run with `ORDERED` changes, where they fit, over a network that loses and doubles some samples."""
+    """Returns a run with those `ORDERED` changes that fit, over a network that loses and
+    doubles some samples.
+    """
     at: dict[str, dict[int, list[list[int]]]] = {}
     for name in scenario.names:
         at[name] = {}
@@ -180,7 +182,7 @@ def driven(
 
 @cache
 def simulated(name: str) -> Log:
-    """Two seconds of a shipped scenario, or of four sites with rates of their own."""
+    """Returns two seconds of a shipped scenario, or of four sites with different rates."""
     if name == "four":
         return trilat_net.simulate(parse_scenario(FOUR))
     return trilat_net.simulate(name, {"duration_s": 2, "rate_hz": 200})
@@ -206,7 +208,9 @@ def rewritten(
     finished: bool = True,
     others: Sequence[LinkStats | Event] = (),
 ) -> Log:
-    """The log with some of its records, changed, and other messages, in a file of its own."""
+    """Returns the log with a selection of its records, changed records, and other messages, in
+    a new file.
+    """
     stream = io.BytesIO()
     writer = LogWriter(
         stream, log.scenario, "again", driver, 1_700_000_000 * 10**9, collect_provenance()
@@ -236,7 +240,7 @@ def rewritten(
 
 
 def timed(log: Log) -> Log:
-    """The log as if a clock had been read: every loop late by its tick in us, every tick 7 us of work."""
+    """Returns the log with clock readings: every loop late by its tick in us, every tick 7 us of work."""
     return rewritten(
         log,
         change=lambda state: msgspec.structs.replace(state, late_us=state.tick, busy_us=7),
@@ -255,7 +259,7 @@ def replaced(state: State, **fields: object) -> State:
 
 
 def in_modes(modes: Sequence[str]) -> SiteLog:
-    """The first records of a site of `paper`, with other modes."""
+    """Returns the first records of a site of `paper`, with other modes."""
     part = simulated("paper")["m1"]
     states = [
         replaced(state, mode=mode) for state, mode in zip(part.states, modes, strict=False)

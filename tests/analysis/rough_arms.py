@@ -1,4 +1,6 @@
-"""Arms of six joints that do all a chain can: friction, stops, an operator, a wall in space, limits."""
+"""Arms of six joints with everything that a chain supports: friction, stops, an operator, a
+wall in space, limits.
+"""
 
 from functools import cache
 from importlib import resources
@@ -40,7 +42,7 @@ DYNAMICS = '<dynamics damping="0.8" friction="1.5"/>'
 
 
 def rough_urdf() -> str:
-    """`arm6.urdf` with friction at every joint, and an elbow that stops at 1.55 rad."""
+    """Returns `arm6.urdf` with friction at every joint, and an elbow that stops at 1.55 rad."""
     text = (resources.files(trilat_net) / "scenarios" / "arm6.urdf").read_text(encoding="utf-8")
     rubbed = text.replace("<limit ", f"{DYNAMICS}<limit ")
     elbow = rubbed.index('<joint name="elbow"')
@@ -50,5 +52,5 @@ def rough_urdf() -> str:
 
 @cache
 def rough_log() -> Log:
-    """Its run in virtual time."""
+    """Returns the log of the rough arm in virtual time."""
     return trilat_net.simulate(parse_scenario(f"{ROUGH}{rough_urdf()}'''\n"))

@@ -1,4 +1,4 @@
-"""Records as columns: whole and marked where there are gaps, and a function of time for who looks back."""
+"""Records as columns, whole and marked at gaps; and a function of time for delayed values."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from tests.analysis import logs
 from trilat_net.analysis.aligned import RECORD_COLUMNS, PeerTrajectory, align_records
 
 
-def test_a_whole_log_is_as_it_was_recorded() -> None:
+def test_a_whole_log_keeps_its_records() -> None:
     log = logs.simulated("paper")
     for site, track in align_records(log, common=True).items():
         assert track.known.all()
@@ -23,7 +23,7 @@ def test_a_whole_log_is_as_it_was_recorded() -> None:
         )
 
 
-def test_a_gap_is_filled_straight_and_marked() -> None:
+def test_gaps_are_filled_linearly_and_marked() -> None:
     whole = logs.simulated("paper")
     log = logs.rewritten(
         whole, lambda state: not (state.site == "s" and 100 <= state.tick < 120)
@@ -34,7 +34,7 @@ def test_a_gap_is_filled_straight_and_marked() -> None:
     assert np.array_equal(track.q[track.known], log["s"].q)
 
 
-def test_end_is_that_of_time_that_all_sites_have() -> None:
+def test_tracks_end_with_the_last_common_time() -> None:
     log = logs.rewritten(
         logs.simulated("four"),
         lambda state: (
@@ -42,14 +42,14 @@ def test_end_is_that_of_time_that_all_sites_have() -> None:
             and (state.site != "d" or state.t_ns < 12e8)
         ),
     )
-    found = align_records(log, common=True)
-    assert {site: track.t_s[0] for site, track in found.items()} == {
+    aligned_records = align_records(log, common=True)
+    assert {site: track.t_s[0] for site, track in aligned_records.items()} == {
         "a": 0.5,
         "b": 0.0,
         "c": 0.0,
         "d": 0.0,
     }
-    assert all(1.2 - 0.03 < track.t_s[-1] < 1.2 for track in found.values())
+    assert all(1.2 - 0.03 < track.t_s[-1] < 1.2 for track in aligned_records.values())
     assert (
         align_records(
             logs.rewritten(log, lambda state: state.site != "a" or state.t_ns > 13e8),
@@ -59,7 +59,7 @@ def test_end_is_that_of_time_that_all_sites_have() -> None:
     )
 
 
-def test_a_diverged_record_is_left_out_of_a_track() -> None:
+def test_a_diverged_record_is_left_out() -> None:
     log = logs.diverged()
     last = {site: track.t_s[-1] for site, track in align_records(log, common=True).items()}
     gone = [site for site in log.sites if log[site].states[-1].mode == "diverged"]
@@ -70,7 +70,7 @@ def test_a_diverged_record_is_left_out_of_a_track() -> None:
     )
 
 
-def test_past_is_records_at_ticks_and_rest_before_them() -> None:
+def test_the_past_begins_at_rest() -> None:
     track = align_records(logs.simulated("four"), common=True)["b"]
     now, before = (
         PeerTrajectory(track).evaluate(track.t_s),
@@ -87,7 +87,7 @@ def test_past_is_records_at_ticks_and_rest_before_them() -> None:
     assert before.known.all()
 
 
-def test_between_ticks_it_is_the_cubic_through_angles_and_velocities() -> None:
+def test_values_between_ticks_are_cubic() -> None:
     track = align_records(logs.simulated("two_sites"), common=True)["m"]
     t_s = track.t_s
     track.q[:] = np.stack([t_s**3 - t_s, 2.0 - t_s**2], axis=1)
@@ -98,7 +98,7 @@ def test_between_ticks_it_is_the_cubic_through_angles_and_velocities() -> None:
     )
 
 
-def test_what_lies_in_a_gap_rests_on_no_record() -> None:
+def test_values_in_a_gap_are_not_recorded() -> None:
     whole = logs.simulated("paper")
     log = logs.rewritten(whole, lambda state: not (state.site == "m1" and state.tick == 100))
     at_s = np.array([98.0, 99.0, 99.5, 100.0, 100.5, 101.0, 102.0]) / 200

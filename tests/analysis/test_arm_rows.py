@@ -31,33 +31,35 @@ def _hangs(arm: ArmRows, pose: Sequence[float] | np.ndarray) -> bool:
 
 
 def chain_of(name: str, **drive: float) -> ChainArmRows:
-    """A reference's chain with gravity along its z axis."""
+    """Returns a reference's chain with gravity along its z axis."""
     chain = REFERENCES[name].chain
     joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
-        for one in chain.joints
+        ChainJoint(
+            joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
+        )
+        for joint in chain.joints
     )
-    theta = np.concatenate([one.inertia for one in chain.joints])
+    theta = np.concatenate([joint.inertia for joint in chain.joints])
     return ChainArmRows(theta, ChainSetup(joints, (0.0, 0.0, -9.81), chain.tip_origin_m))
 
 
-def drawn(joints: int, rows: int = 5) -> list[Array]:
+def draw_rows(joints: int, rows: int = 5) -> list[Array]:
     return list(np.random.default_rng(joints).normal(size=(4, rows, joints)))
 
 
 @each
-def test_torque_inertia_gradient_and_end_effector_are_those_of_pinocchio(name: str) -> None:
+def test_torque_inertia_gradient_and_tip_equal_pinocchios(name: str) -> None:
     arm = chain_of(name)
     for state in REFERENCES[name].states:
-        there = arm._replace(
+        placed_arm = arm._replace(
             chain=arm.chain._replace(gravity_m_s2=tuple(state.gravity.tolist()))
         )
         q, qd, v, a, r = (x[np.newaxis] for x in (state.q, state.qd, state.v, state.a, state.r))
-        torque = there.law_torque(arm.theta[np.newaxis], q, qd, v, a)[0]
+        torque = placed_arm.law_torque(arm.theta[np.newaxis], q, qd, v, a)[0]
         np.testing.assert_allclose(
             torque, state.inverse_dynamics, atol=1e-12 * (1 + np.abs(torque).max())
         )
-        gradient = there.gradient(q, qd, v, a, r)[0]
+        gradient = placed_arm.gradient(q, qd, v, a, r)[0]
         np.testing.assert_allclose(gradient, state.regressor_transpose_r, atol=1e-11)
         np.testing.assert_allclose(
             arm.multiply_inertia(q, a)[0], state.inertia @ state.a, atol=1e-12
@@ -72,18 +74,18 @@ def test_torque_inertia_gradient_and_end_effector_are_those_of_pinocchio(name: s
 def test_the_slope_of_the_potential_energy_is_gravity(name: str) -> None:
     arm = chain_of(name)
     n, step = len(arm.chain.joints), 1e-5
-    q = drawn(n, 1)[0]
+    q = draw_rows(n, 1)[0]
     poses = q + step * np.vstack([np.eye(n), -np.eye(n)])
     up, down = np.split(arm.potential_energy(poses), 2)
     np.testing.assert_allclose((up - down) / (2 * step), arm.gravity_torque(q)[0], atol=2e-8)
 
 
-def test_friction_and_stops_are_what_the_core_takes_and_gives() -> None:
-    """M qdd changes by them, and by nothing else."""
+def test_friction_and_stops_equal_the_cores() -> None:
+    """M qdd changes by friction and stops, and by nothing else."""
     drive = {"viscous": 0.4, "coulomb": 1.2}
     stop = {"lower": -0.5, "upper": 0.5, "stop_stiffness": 800.0, "stop_damping": 9.0}
     rough, smooth = chain_of("arm6", **drive, **stop), chain_of("arm6")
-    q, qd, torque, _ = drawn(6, 20)
+    q, qd, torque, _ = draw_rows(6, 20)
     qd[0] *= 1e-3  # within the smooth part of Coulomb's friction
     forces = []
     for arm in (rough, smooth):
@@ -92,21 +94,19 @@ def test_friction_and_stops_are_what_the_core_takes_and_gives() -> None:
             place_joints(rows, q[k])
             find_acceleration(rows, arm.theta, np.zeros(3), q[k], qd[k], torque[k], qdd[k])
         forces.append(smooth.multiply_inertia(q, qdd))
-    found = rough.stop_torque(q, qd) - rough.friction(qd)
+    resistance = rough.stop_torque(q, qd) - rough.friction(qd)
     assert (rough.stop_torque(q, qd) != 0.0).any(axis=0).all()
-    np.testing.assert_allclose(found, forces[0] - forces[1], atol=1e-10)
+    np.testing.assert_allclose(resistance, forces[0] - forces[1], atol=1e-10)
 
 
-def test_the_planar_arm_is_the_same_as_a_chain() -> None:
-    written = Arm(
-        l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25
-    )
-    model = build_arm(written, Task(), {}, chains=True)
+def test_the_planar_arm_equals_its_chain() -> None:
+    arm = Arm(l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25)
+    model = build_arm(arm, Task(), {}, chains=True)
     assert model.chain is not None
-    theta = build_arm(written, Task(), {}, chains=False).theta
+    theta = build_arm(arm, Task(), {}, chains=False).theta
     plane = PlanarArmRows(theta, 9.81, (0.8, 0.6))
     chain = ChainArmRows(model.theta, model.chain)
-    q, qd, v, a = drawn(2)
+    q, qd, v, a = draw_rows(2)
     np.testing.assert_allclose(plane.gravity_torque(q), chain.gravity_torque(q), atol=1e-12)
     np.testing.assert_allclose(
         plane.multiply_inertia(q, a), chain.multiply_inertia(q, a), atol=1e-12
@@ -130,7 +130,7 @@ def test_the_planar_arm_is_the_same_as_a_chain() -> None:
         assert _hangs(plane, pose) is _hangs(chain, pose) is hangs
 
 
-def test_arm_hangs_where_it_stores_hardly_more_energy_than_anywhere() -> None:
+def test_arms_hang_near_their_least_potential_energy() -> None:
     """The links of a UR5 point along -x of their frames: shoulder_lift at +90 degrees is straight down."""
     arm = chain_of("arm6")
     down = np.array([0.4, 0.5 * np.pi, 0.0, 0.0, 0.0, 1.0])
@@ -144,8 +144,8 @@ def test_arm_hangs_where_it_stores_hardly_more_energy_than_anywhere() -> None:
 
 
 @pytest.mark.parametrize(("name", "count"), [("random2", 10), ("arm6", 36), ("arm7", 43)])
-def test_base_parameters_are_as_many_as_regressors_have_rank(name: str, count: int) -> None:
-    """36 of a UR5 is what Pinocchio's regressors give; the rank by SVD of other states agrees."""
+def test_base_parameters_count_the_regressors_rank(name: str, count: int) -> None:
+    """36 of a UR5 is the number by Pinocchio's regressors; the rank by SVD of other states agrees."""
     arm = chain_of(name)
     base = find_base_parameters(arm, np.ones(len(arm.theta), dtype=np.bool_))
     assert len(base.kept) == count == np.linalg.matrix_rank(stack_regressors(arm, 77), tol=1e-7)
@@ -153,7 +153,7 @@ def test_base_parameters_are_as_many_as_regressors_have_rank(name: str, count: i
 
 
 @each
-def test_base_parameters_leave_out_only_what_makes_no_torque(name: str) -> None:
+def test_base_parameters_omit_only_torque_free_combinations(name: str) -> None:
     """Pinocchio's Y'r has no part that is orthogonal to the rows of the combination."""
     arm = chain_of(name)
     B = find_base_parameters(arm, np.ones(len(arm.theta), dtype=np.bool_)).combination
@@ -166,11 +166,11 @@ def test_base_parameters_leave_out_only_what_makes_no_torque(name: str) -> None:
         assert np.abs(left).max() <= 1e-9 * (1.0 + np.abs(Yr).max())
     null = np.random.default_rng(3).normal(size=len(arm.theta))
     null -= B.T @ np.linalg.lstsq(B.T, null, rcond=None)[0]
-    q, qd, v, a = drawn(len(arm.chain.joints))
+    q, qd, v, a = draw_rows(len(arm.chain.joints))
     assert np.abs(arm.law_torque(null[np.newaxis], q, qd, v, a)).max() <= 1e-8
 
 
-def test_parameters_that_are_not_learnt_join_no_combination() -> None:
+def test_fixed_parameters_join_no_combination() -> None:
     arm = chain_of("arm6")
     learnt = np.arange(60) % 10 < 4
     base = find_base_parameters(arm, learnt)
@@ -179,7 +179,7 @@ def test_parameters_that_are_not_learnt_join_no_combination() -> None:
 
 
 def body(places: Array, masses: Array) -> Array:
-    """Ten parameters of point masses."""
+    """Returns ten parameters of point masses."""
     m, mc = masses.sum(), masses @ places
     inertia = np.sum(
         [
@@ -192,7 +192,7 @@ def body(places: Array, masses: Array) -> Array:
     return np.array([m, *mc, xx, xy, yy, xz, yz, zz])
 
 
-def test_a_body_with_a_negative_mass_is_not_consistent() -> None:
+def test_a_negative_mass_is_inconsistent() -> None:
     random = np.random.default_rng(4)
     places, masses = random.normal(size=(6, 3)), random.uniform(0.5, 2.0, 6)
     sound = body(places, masses)

@@ -1,6 +1,5 @@
-"""Shares over time are what the core's own function of time gives at every tick.
-
-beta: the left null vector, scaled by Kd; groups of sites that follow nobody outside.
+"""Shares over time equal the core's own function of time at every tick. beta: the left null
+vector, scaled by Kd; groups of sites that follow nobody outside.
 """
 
 import numpy as np
@@ -30,28 +29,28 @@ ramps = st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0))
 
 @settings(max_examples=40)
 @given(st.lists(ramps, max_size=4, unique_by=lambda ramp: ramp[0]))
-def test_they_are_the_cores(drawn: list[tuple[int, int, float]]) -> None:
+def test_shares_equal_the_cores(drawn: list[tuple[int, int, float]]) -> None:
     tick_ns = 10**9 // RATE_HZ
     changes = [DominanceRamp(a * tick_ns, (a + n) * tick_ns, (x, 1.0 - x)) for a, n, x in drawn]
-    found = evaluate_ramps(
+    shares = evaluate_ramps(
         np.array([0.5, 0.5]), changes, np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
     )
     rows = [[0.0, 0.0, 0.5, 0.5], *([r.start_ns, r.end_ns, *r.alpha] for r in sorted(changes))]
     links = np.zeros(2, link_dtype(2))
     for k in range(100):
         apply_ramps(k * tick_ns, len(rows), np.array(rows, dtype=float), links)
-        assert found.alpha[k] == pytest.approx(links["alpha"], abs=1e-9)
-        assert found.rate[k] == pytest.approx(links["alpha_rate"], abs=1e-6)
+        assert shares.alpha[k] == pytest.approx(links["alpha"], abs=1e-9)
+        assert shares.rate[k] == pytest.approx(links["alpha_rate"], abs=1e-6)
 
 
-def test_before_a_sudden_change_they_are_as_they_were() -> None:
+def test_shares_before_a_sudden_change_are_kept() -> None:
     step = DominanceRamp(10**9, 10**9, (1.0, 0.0))
-    found = evaluate_ramps(
+    shares = evaluate_ramps(
         np.array([0.5, 0.5]), [step], np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
     )
-    assert found.before[49].tolist() == [0.5, 0.5]
-    assert found.alpha[50].tolist() == [1.0, 0.0]
-    assert not found.constant
+    assert shares.before[49].tolist() == [0.5, 0.5]
+    assert shares.alpha[50].tolist() == [1.0, 0.0]
+    assert not shares.constant
     assert evaluate_ramps(np.array([0.5, 0.5]), [], np.arange(9.0), 1.0).constant
 
 
@@ -72,7 +71,7 @@ def ramped():
     return trilat_net.simulate("paper", RAMPS)
 
 
-def test_a_ramp_begins_where_the_one_before_it_is(ramped):
+def test_a_ramp_begins_where_the_previous_ends(ramped):
     part = ramped["s"]
     alpha = trace_dominance(ramped, "s", part.t_s).alpha
     at = [0.5, 1.0, 1.5, 2.0, 2.75, 3.5, 4.9, 5.1]
@@ -82,8 +81,8 @@ def test_a_ramp_begins_where_the_one_before_it_is(ramped):
     assert alpha.sum(axis=1) == pytest.approx(np.ones(len(part)))
 
 
-def test_they_are_the_factors_of_the_recorded_references(ramped):
-    """Eq. (6) with them and the samples in use gives the recorded reference."""
+def test_shares_give_the_recorded_references(ramped):
+    """Eq. (6) with the shares and the samples in use gives the recorded reference."""
     part = ramped["s"]
     alpha = trace_dominance(ramped, "s", part.t_s).alpha
     reference = np.zeros_like(part.q)
@@ -114,32 +113,34 @@ def test_pi_is_the_eigenvector_that_numpy_finds(n: int, seed: int) -> None:
 
 
 @given(st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3))
-def test_scaled_kd_cancels_what_sites_pass_on(scales: list[float]) -> None:
+def test_scaled_kd_cancels_forwarded_motion(scales: list[float]) -> None:
     """sum_i beta_i ( |x_i|^2_Kd_i - sum_j alpha_ij |x_j|^2_Kd_i ) = 0 for all x, Eq. (20)."""
     Kd = np.outer(scales, [3.0, 0.4])
-    found = compute_lyapunov_weights(THREE, Kd)
+    weights = compute_lyapunov_weights(THREE, Kd)
     norms = np.random.default_rng(1).random((3, 2))
     passed = [Kd[i] @ (norms[i] - THREE[i] @ norms) for i in range(3)]
-    assert found.beta @ passed == pytest.approx(0.0, abs=1e-9 * max(scales) * found.beta.max())
-    assert found.beta.sum() == pytest.approx(3.0)
+    assert weights.beta @ passed == pytest.approx(
+        0.0, abs=1e-9 * max(scales) * weights.beta.max()
+    )
+    assert weights.beta.sum() == pytest.approx(3.0)
 
 
-def test_equal_shares_and_kd_give_the_ones_of_the_paper() -> None:
+def test_equal_shares_and_kd_give_the_papers_ones() -> None:
     assert compute_lyapunov_weights(THREE, np.full((3, 2), 3.0)).beta == pytest.approx(
         np.ones(3)
     )
 
 
-def test_kd_of_different_shape_have_no_scalar() -> None:
+def test_kd_of_different_shapes_have_no_scalar() -> None:
     assert find_kd_scales(np.array([[0.1, 30.0], [30.0, 0.1], [3.0, 3.0]])) is None
     assert find_kd_scales(np.array([[1.0, 1.0], [0.0, 0.0]])) is None
     assert find_kd_scales(np.zeros((3, 2))) == pytest.approx(np.ones(3))
 
 
 def test_a_site_that_nobody_follows_has_no_weight() -> None:
-    found = compute_lyapunov_weights(EXPERT, np.ones((3, 2)))
-    assert found.groups == ((0, 2),)
-    assert found.beta == pytest.approx([1.5, 0.0, 1.5])
+    weights = compute_lyapunov_weights(EXPERT, np.ones((3, 2)))
+    assert weights.groups == ((0, 2),)
+    assert weights.beta == pytest.approx([1.5, 0.0, 1.5])
 
 
 def test_two_groups_that_follow_nobody_outside_are_named() -> None:
@@ -147,7 +148,7 @@ def test_two_groups_that_follow_nobody_outside_are_named() -> None:
 
 
 @pytest.mark.parametrize("mem", [[], [0.5] * 11])
-def test_a_record_that_lacks_who_is_lost_is_told(mem: list[float]) -> None:
+def test_a_record_without_lost_peers_is_reported(mem: list[float]) -> None:
     rule = {"on_stale.action": "glide", "on_stale.on_lost": "degrade", "duration_s": 0.1}
     data = recorded("paper", rule | {"on_stale.align_limit_rad": 2.0})
     broken = edited(

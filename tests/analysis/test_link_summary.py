@@ -1,6 +1,6 @@
-"""What links did, from records: against the core's own counts, and against the theory of ages.
+"""Link statistics from records, against the core's own counts and against the theory of ages.
 
-What becomes of samples, computed from a log, against the links of the core that decide it.
+The fate of samples, computed from a log, against the links of the core that decide it.
 """
 
 import math
@@ -51,7 +51,7 @@ def counted(run, link):
 
 
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
-def test_counts_are_those_of_the_link_itself(link):
+def test_counts_equal_those_of_the_link(link):
     counts, core = busy()[link].counts, counted(logs.busy(), link)
     assert counts.arrived + counts.duplicate == core.accepted
     assert (counts.lost, counts.late, counts.duplicate) == (
@@ -65,7 +65,7 @@ def test_counts_are_those_of_the_link_itself(link):
     assert counts.superseded <= core.superseded <= counts.superseded + waiting
 
 
-def test_what_was_superseded_is_in_use_in_no_record():
+def test_superseded_samples_are_never_in_use():
     log = logs.busy().log
     for peer, site in [("b", "a"), ("c", "a"), ("c", "b")]:
         release = predict_delivery(log, peer, site, log.scenario.ticks(peer)).release(
@@ -82,71 +82,75 @@ def test_what_was_superseded_is_in_use_in_no_record():
         assert busy()[f"{peer}->{site}"].counts.superseded == len(never) > 0
 
 
-def test_what_the_network_lost_and_doubled_is_counted():
+def test_lost_and_doubled_samples_are_counted():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
-    run = logs.driven(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
-    found = uses(run.log)
-    lossy = found["m2->m1"]
+    run = logs.drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
+    link_uses = uses(run.log)
+    lossy = link_uses["m2->m1"]
     assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
     assert lossy.loss == 14 / 199
     assert lossy.burst == 14 / 3
     assert lossy.silence_ms == 55.0  # ten samples of 5 ms, and the one that came again
     assert not lossy.plain
-    assert found["m2->s"].counts.duplicate == 2
+    assert link_uses["m2->s"].counts.duplicate == 2
     assert counted(run, "m2->s").duplicate == 2
-    assert (found["s->m1"].counts.missing, found["s->m1"].burst, found["s->m1"].loss) == (
+    assert (
+        link_uses["s->m1"].counts.missing,
+        link_uses["s->m1"].burst,
+        link_uses["s->m1"].loss,
+    ) == (
         0,
         None,
         0.0,
     )
 
 
-def test_a_missing_records_samples_are_neither_lost_nor_arrived():
+def test_samples_of_missing_records_have_no_fate():
     log = logs.rewritten(
         logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
     )
-    found = uses(log)
+    link_uses = uses(log)
     for link in ("m1->m2", "s->m2"):
-        counts = found[link].counts
+        counts = link_uses[link].counts
         assert (counts.missing, counts.lost, counts.late) == (0, 0, 0)
         assert counts.judged == counts.arrived == 399 - 50
     # its samples came, though its own records are gone
-    assert found["m2->s"].counts.missing == 0
+    assert link_uses["m2->s"].counts.missing == 0
 
 
-def test_a_link_cut_until_the_end_loses_all_samples():
+def test_a_link_cut_until_the_end_loses_everything():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
-    run = logs.driven(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
+    run = logs.drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
     cut = uses(run.log)["m2->m1"]
     assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
     assert cut.silence_ms == 1000.0 - (99 * 5.0 + 20.0)
 
 
-def test_late_samples_are_those_of_the_core():
+def test_late_samples_equal_those_of_the_core():
     """Every sample of a link takes longer than the link's delay."""
     log = logs.simulated("free")
     hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
     assert hurried != log.scenario.text
-    run = logs.driven(parse_scenario(hurried))
+    run = logs.drive_run(parse_scenario(hurried))
     for use in summarise_links(run.log):
         assert use.counts.late == counted(run, use.name).late
 
 
-def test_a_stamp_out_of_range_is_refused_and_nothing_else():
+def test_only_out_of_range_stamps_are_refused():
     def hostile(state):
         return logs.replaced(
             state,
             rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx,
         )
 
-    found = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
-    assert [use.counts.refused for use in found.values()] == [1] * 6
-    assert [use.counts.sent for use in found.values()] == [400] * 6
+    link_uses = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
+    assert [use.counts.refused for use in link_uses.values()] == [1] * 6
+    assert [use.counts.sent for use in link_uses.values()] == [400] * 6
 
 
-def test_record_of_tick_that_is_never_made_costs_no_memory():
-    """Ticks are the sender's word: a false one must not make tables as long as it says."""
+def test_false_tick_numbers_cost_no_memory():
+    """Tick numbers come from the sender: a false one must not enlarge the tables."""
 
     def far(state):
         return (
@@ -164,7 +168,7 @@ def test_record_of_tick_that_is_never_made_costs_no_memory():
 # -- ages
 
 
-def test_without_jitter_the_effective_delay_is_the_stated_one():
+def test_effective_delay_without_jitter_is_the_stated():
     for use in summarise_links(logs.simulated("paper")):
         assert use.plain
         assert use.one_way_us is None
@@ -175,7 +179,7 @@ def test_without_jitter_the_effective_delay_is_the_stated_one():
 
 
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
-def test_ages_in_records_are_what_fates_of_samples_make_them(link):
+def test_recorded_ages_follow_from_fates_of_samples(link):
     peer, site = link.split("->")
     log, part = logs.busy().log, logs.busy().log[site]
     fate = predict_delivery(log, peer, site, log.scenario.ticks(peer))
@@ -235,10 +239,12 @@ def jittery(order):
 @pytest.mark.parametrize(
     ("order", "theory", "margin"), [("newest", newest_wins, 0.1), ("in_order", in_order, 0.2)]
 )
-def test_the_effective_delay_under_jitter_is_that_of_theory(link, order, theory, margin):
-    """P(age > n h) is a product over independent samples, summed here; the run draws and simulates.
+def test_effective_delay_under_jitter_follows_theory(link, order, theory, margin):
+    """P(age > n h) is a product over independent samples, summed here; the run draws and
+    simulates.
 
-    A run of two seconds begins with nothing older to wait for, and the largest of many delays varies.
+    A run of two seconds starts with nothing older to wait for, and the largest of many delays
+    varies.
     """
     log = jittery(order)
     mean_ms, deviation_ms = theory(MODELS[link][1], PERIOD_MS)
@@ -252,14 +258,16 @@ def test_the_effective_delay_under_jitter_is_that_of_theory(link, order, theory,
 
 
 def long_ages(release):
-    """Ages at the ticks of a receiver that every sample reaches in time, in periods."""
+    """Returns ages at the ticks of a receiver that every sample reaches in time, in periods."""
     newest = np.full(len(release), -1)
     np.maximum.at(newest, np.minimum(release, len(release) - 1), np.arange(len(release)))
     return np.arange(len(release)) - np.maximum.accumulate(newest)
 
 
-def test_the_figures_that_are_quoted():
-    """200 ms +- 50 ms at 1 kHz becomes 162 ms, 0-400 ms becomes 25 ms; in order it is longer than stated."""
+def test_effective_delays_equal_the_documented_figures():
+    """200 ms +- 50 ms at 1 kHz becomes 162 ms, 0-400 ms becomes 25 ms; in order the delay is
+    longer than stated.
+    """
     assert newest_wins(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(162.2, abs=0.05)
     assert newest_wins(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(24.74, abs=0.05)
     assert in_order(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(238.8, abs=0.05)
@@ -269,7 +277,7 @@ def test_the_figures_that_are_quoted():
 # -- losses
 
 
-def test_loss_and_bursts_as_seen_are_those_of_the_model():
+def test_measured_loss_and_bursts_follow_the_model():
     scenario = load_scenario(
         "two_sites",
         {"duration_s": 30.0, "rate_hz": 100, "link.loss": 0.2, "link.loss_burst": 5.0},
@@ -281,7 +289,7 @@ def test_loss_and_bursts_as_seen_are_those_of_the_model():
         assert use.counts.missing == 0
 
 
-def test_playout_makes_jitter_below_its_budget_constant():
+def test_playout_makes_smaller_jitter_constant():
     use = busy()["b->c"]
     assert use.drawn_ms.deviation == pytest.approx(20.0, rel=0.4)
     assert use.age_ms.p50 < 80.0  # a tick of 5 ms, a sample every 6.67 ms
@@ -291,7 +299,7 @@ def test_playout_makes_jitter_below_its_budget_constant():
 # -- spreads and histograms
 
 
-def test_histogram_counts_every_tick_in_few_bins_of_round_width():
+def test_histogram_counts_ticks_in_few_round_bins():
     for use in busy().values():
         bins = use.ages
         assert sum(bins.ticks) == pytest.approx(
@@ -303,7 +311,7 @@ def test_histogram_counts_every_tick_in_few_bins_of_round_width():
         assert f"{bins.width_ms:e}"[0] in "125"
 
 
-def test_one_age_is_one_bin():
+def test_one_age_gives_one_bin():
     assert bin_ages(np.full(7, 200_000_000)).ticks == [7]
     assert bin_ages(np.zeros(0, dtype=np.int64)) is None
     assert compute_statistics([]) is None
@@ -312,7 +320,7 @@ def test_one_age_is_one_bin():
 # -- logs that cannot tell
 
 
-def test_an_empty_log_tells_nothing():
+def test_an_empty_log_has_no_link_statistics():
     log = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
     for use in summarise_links(log):
         assert use.stated[0].link.delay_ms == 200.0
@@ -322,7 +330,7 @@ def test_an_empty_log_tells_nothing():
         ) * 6
 
 
-def test_measured_delays_are_those_in_the_records():
+def test_measured_delays_equal_those_in_the_records():
     def timed(state):
         return logs.replaced(
             state, rx=[[j, tick, 100 * (j + 1) + tick] for j, tick, _ in state.rx]
@@ -341,7 +349,7 @@ LINKS = [(peer, site) for site in "abc" for peer in "abc" if peer != site]
 
 
 def decided(peer: str, site: str) -> Site:
-    """The site of the core, told of every change at the tick that took it in."""
+    """Returns the site of the core, given every change at the tick at which it was applied."""
     log = logs.busy().log
     core = Site(log.scenario.setup(site))
     index = log[site].peers.index(peer)
@@ -353,16 +361,16 @@ def decided(peer: str, site: str) -> Site:
 
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
-def test_a_fate_is_what_the_link_of_the_core_decides(peer, site):
+def test_fates_equal_those_of_the_cores_link(peer, site):
     log, core = logs.busy().log, decided(peer, site)
-    found = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
+    delivery_ticks = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
     index = log[site].peers.index(peer)
     expected = [core.release_tick(index, sample) for sample in range(COUNT)]
-    assert found == [LOST if tick is None else tick for tick in expected]
+    assert delivery_ticks == [LOST if tick is None else tick for tick in expected]
 
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
-def test_fate_does_not_depend_on_how_many_are_asked_for(peer, site, monkeypatch):
+def test_fates_are_independent_of_the_sample_count(peer, site, monkeypatch):
     log = logs.busy().log
     whole = predict_delivery(log, peer, site, COUNT)
     monkeypatch.setattr(module, "_BLOCK", 64)
@@ -373,7 +381,7 @@ def test_fate_does_not_depend_on_how_many_are_asked_for(peer, site, monkeypatch)
     assert len(predict_delivery(log, peer, site, 0).due_ns) == 0
 
 
-def test_order_and_playout_come_on_top_of_what_is_drawn():
+def test_order_and_playout_follow_the_drawn_delays():
     log = logs.busy().log
     for peer, site in LINKS:
         fate = predict_delivery(log, peer, site, COUNT)
@@ -385,7 +393,7 @@ def test_order_and_playout_come_on_top_of_what_is_drawn():
     assert (late.drawn_ns - late.stamp_ns).min() < 70_000_000
 
 
-def test_what_is_lost_is_what_link_was_said_to_lose():
+def test_lost_samples_equal_those_of_the_link():
     log = logs.busy().log
     cut = predict_delivery(log, "a", "b", COUNT)
     in_outage = (cut.stamp_ns >= 2 * 10**9) & (cut.stamp_ns < 3 * 10**9)
@@ -396,6 +404,6 @@ def test_what_is_lost_is_what_link_was_said_to_lose():
 
 
 @given(st.lists(st.integers(0, 10**14), max_size=20), st.integers(1, 20_000))
-def test_first_ticks_are_those_of_the_grid(due_ns, rate_hz):
-    found = first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)
-    assert found.tolist() == [first_tick_at(due, rate_hz) for due in due_ns]
+def test_first_ticks_follow_the_grid(due_ns, rate_hz):
+    ticks = first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)
+    assert ticks.tolist() == [first_tick_at(due, rate_hz) for due in due_ns]

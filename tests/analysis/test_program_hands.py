@@ -22,7 +22,7 @@ def simulate_program(kind: str, duration_s: float, **settings: Any) -> Log:
     return tn.simulate("free", {"sites.m2.hands": [hand]}, duration_s=duration_s)
 
 
-def test_roots_of_a_loop_with_a_program_are_no_proof() -> None:
+def test_roots_of_program_loops_are_no_proof() -> None:
     log = simulate_program("Follower", 5.0)
     roots = find_log_roots(log)
     assert roots.verdict == "stable"
@@ -36,7 +36,7 @@ def test_roots_of_a_loop_with_a_program_are_no_proof() -> None:
     assert script.leaves_out == ""
 
 
-def test_judgement_names_what_it_leaves_out_of_a_program() -> None:
+def test_judgement_names_the_omitted_program_reaction() -> None:
     certificate = tn.certify(simulate_program("Follower", 5.0))
     assert "exact roots" not in certificate.decision.rests_on
     remark = next(text for text in certificate.remarks if text.startswith("a program moves m2"))

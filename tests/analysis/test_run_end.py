@@ -1,4 +1,4 @@
-"""What a run does at its end, of signals whose answer is known."""
+"""The classification of a run's end, for signals whose class is known."""
 
 from collections.abc import Callable
 from functools import cache
@@ -31,7 +31,7 @@ def still() -> Log:
 
 
 def moving(e: Callable[[float], float], qd: Callable[[float], float]) -> Log:
-    """A log whose sites move like that."""
+    """Returns a log whose sites move as given."""
 
     def changed(state):
         t_s = state.t_ns * 1e-9
@@ -75,16 +75,16 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
     ],
 )
 def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None:
-    found = classify_log_end(moving(e, qd))
-    assert found.behaviour is motion
-    assert says in found.text
+    run_end = classify_log_end(moving(e, qd))
+    assert run_end.behaviour is motion
+    assert says in run_end.text
 
 
 @pytest.mark.parametrize(
     ("d", "motion"),
     [(0.9, EndBehaviour.GROWS), pytest.param(1.2, EndBehaviour.DECAYS, marks=pytest.mark.long)],
 )
-def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> None:
+def test_the_p_d_margin_shows_in_60_s(d: float, motion: EndBehaviour) -> None:
     """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
     assert (
         classify_log_end(
@@ -95,7 +95,7 @@ def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> No
 
 
 @pytest.mark.long
-def test_slow_loop_without_delay_sustains_what_faster_one_ends() -> None:
+def test_slow_loops_sustain_what_faster_ones_damp() -> None:
     """`digital` with the paper's gains: about 1 rad/s at 100 Hz, and 200 Hz settles."""
     held = {"scheme": "digital", "link.delay_ms": 0.0}
     slow = classify_log_end(
@@ -110,7 +110,7 @@ def test_slow_loop_without_delay_sustains_what_faster_one_ends() -> None:
     assert fast.end_speed_rad_s < 0.1
 
 
-def test_hammering_on_a_wall_shows_only_in_a_longer_record() -> None:
+def test_wall_hammering_shows_only_in_longer_records() -> None:
     short, long = (
         classify_log_end(trilat_net.simulate("contact", {"rate_hz": 100, "duration_s": s}))
         for s in (15.0, 30.0)
@@ -121,28 +121,28 @@ def test_hammering_on_a_wall_shows_only_in_a_longer_record() -> None:
 
 
 def test_a_site_without_records_leaves_it_undecided() -> None:
-    found = classify_log_end(
+    run_end = classify_log_end(
         logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
     )
-    assert found.behaviour is EndBehaviour.UNDECIDED
-    assert found.text == "undecided: no record of s"
+    assert run_end.behaviour is EndBehaviour.UNDECIDED
+    assert run_end.text == "undecided: no record of s"
 
 
-def test_only_times_of_which_all_sites_have_records_count() -> None:
+def test_only_times_recorded_by_all_sites_count() -> None:
     torn = logs.rewritten(
         moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300)
     )
     assert classify_log_end(torn).behaviour is EndBehaviour.UNDECIDED
 
 
-def test_what_came_late_is_undecided() -> None:
-    found = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
-    assert found.behaviour is EndBehaviour.UNDECIDED
-    assert found.stability is Stability.OPEN
-    assert "record longer" in found.text
+def test_a_late_jump_is_undecided() -> None:
+    run_end = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
+    assert run_end.behaviour is EndBehaviour.UNDECIDED
+    assert run_end.stability is Stability.OPEN
+    assert "record longer" in run_end.text
 
 
-def test_a_short_run_is_undecided_and_a_stopped_one_diverged() -> None:
+def test_short_runs_are_undecided_and_stopped_ones_diverged() -> None:
     short = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 50})
     assert classify_log_end(short).behaviour is EndBehaviour.UNDECIDED
     stopped = classify_log_end(logs.diverged())
@@ -155,8 +155,8 @@ def test_a_log_without_records_is_undecided() -> None:
     assert classify_log_end(empty).behaviour is EndBehaviour.UNDECIDED
 
 
-def test_a_growing_joint_is_not_hidden_by_a_decaying_one() -> None:
-    """Joint 2 of s alone grows, at a thousandth of what everything else does."""
+def test_a_decaying_joint_hides_no_growing_one() -> None:
+    """Joint 2 of s alone grows, at a thousandth of all other motion."""
 
     def changed(state):
         t_s = state.t_ns * 1e-9
@@ -164,15 +164,15 @@ def test_a_growing_joint_is_not_hidden_by_a_decaying_one() -> None:
         wide = swing(-0.3)(t_s)
         return logs.replaced(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
 
-    found = classify_log_end(logs.rewritten(still(), change=changed))
-    assert (found.behaviour, found.where) == (EndBehaviour.GROWS, "s joint 2")
-    assert found.stability is Stability.NOT_STABLE
+    run_end = classify_log_end(logs.rewritten(still(), change=changed))
+    assert (run_end.behaviour, run_end.where) == (EndBehaviour.GROWS, "s joint 2")
+    assert run_end.stability is Stability.NOT_STABLE
 
 
 @pytest.mark.parametrize(
     ("pushed", "stability"), [(True, Stability.OPEN), (False, Stability.NOT_STABLE)]
 )
-def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stability) -> None:
+def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stability) -> None:
     hand = {
         "kind": "pulse",
         "start_s": 5.0,
@@ -187,9 +187,9 @@ def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stab
         x = swing(0.2)(state.t_ns * 1e-9)
         return logs.replaced(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
 
-    found = classify_log_end(logs.rewritten(log, change=changed))
-    assert found.behaviour is EndBehaviour.GROWS
-    assert found.stability is stability
+    run_end = classify_log_end(logs.rewritten(log, change=changed))
+    assert run_end.behaviour is EndBehaviour.GROWS
+    assert run_end.stability is stability
 
 
 @pytest.mark.parametrize(
@@ -207,39 +207,33 @@ def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stab
         (0.01, 0.0, 0.0, Stability.SETTLED, ""),
     ],
 )
-def test_sites_at_rest_must_agree_unless_a_force_separates_them(
-    angle, e, tau_x, stability, says
-) -> None:
+def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, says) -> None:
     def changed(state):
         q = [angle if state.site == "s" else 0.0, 0.0]
         return logs.replaced(
             state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0]
         )
 
-    found = classify_log_end(logs.rewritten(still(), change=changed))
-    assert found.stability is stability
-    assert says in found.text
+    run_end = classify_log_end(logs.rewritten(still(), change=changed))
+    assert run_end.stability is stability
+    assert says in run_end.text
 
 
 @pytest.mark.parametrize(
     ("pose", "says"),
     [([-1.5, 0.05], "m, s hang: the arms fell"), ([2.5, 0.0], "away from every start pose")],
 )
-def test_arms_that_hang_or_were_thrown_are_not_called_stable(
-    pose: list[float], says: str
-) -> None:
+def test_hanging_or_thrown_arms_are_not_stable(pose: list[float], says: str) -> None:
     change = lambda s: logs.replaced(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
-    found = classify_log_end(logs.rewritten(still(), change=change))
-    assert found.stability is Stability.OPEN
-    assert says in found.text
+    run_end = classify_log_end(logs.rewritten(still(), change=change))
+    assert run_end.stability is Stability.OPEN
+    assert says in run_end.text
 
 
 @pytest.mark.parametrize(
     ("wide", "motion"), [(0.5, EndBehaviour.UNDECIDED), (0.1, EndBehaviour.BOUNDED)]
 )
-def test_a_joint_fed_by_a_faster_one_does_not_oscillate(
-    wide: float, motion: EndBehaviour
-) -> None:
+def test_a_driven_joint_does_not_oscillate(wide: float, motion: EndBehaviour) -> None:
     """Joint 2 of s is steady at 0.05 rad/s; all else falls, to 0.15 rad/s at the end, or to 0.03."""
 
     def changed(state):
@@ -256,7 +250,9 @@ T_S = np.arange(round(RATE_HZ * SPAN_S)) / RATE_HZ
 
 
 def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
-    """A run of three sites whose joints swing at 1 Hz, or go one way, at a speed, without errors."""
+    """Returns a run of three sites whose joints swing at 1 Hz, or move one way, at a given
+    speed, without errors.
+    """
     qd = np.tile((speed * (1.0 if one_way else np.cos(2.0 * np.pi * T_S)))[:, None], 2)
     q = np.cumsum(qd, axis=0) / RATE_HZ
     bucket = np.arange(len(T_S)) * BUCKETS_PER_S // RATE_HZ
@@ -275,7 +271,7 @@ def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
     ],
     ids=["falls", "grows slowly", "goes on", "goes on slowly", "rounding"],
 )
-def test_a_small_speed_is_rest_only_if_it_falls(speed, behaviour: EndBehaviour) -> None:
+def test_small_speed_is_rest_only_while_falling(speed, behaviour: EndBehaviour) -> None:
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
     assert classify_run_end(scenario, trace(speed(T_S))).behaviour is behaviour
 
@@ -288,9 +284,7 @@ def test_a_small_speed_is_rest_only_if_it_falls(speed, behaviour: EndBehaviour) 
         (4e-3, EndBehaviour.DRIFTS),
     ],
 )
-def test_what_sinks_slowly_has_not_converged(
-    speed_rad_s: float, behaviour: EndBehaviour
-) -> None:
+def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehaviour) -> None:
     """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
     sinking = trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
@@ -301,11 +295,9 @@ def test_what_sinks_slowly_has_not_converged(
     ("at_s", "stability"),
     [(15.0, Stability.SETTLED), (35.0, Stability.SETTLED), (39.0, Stability.OPEN)],
 )
-def test_a_loop_that_changes_last_must_be_seen_after_that(
-    at_s: float, stability: Stability
-) -> None:
+def test_a_late_change_needs_a_longer_record(at_s: float, stability: Stability) -> None:
     later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
-    found = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
-    assert found.stability is stability
-    assert ("the loop changes until 39 s" in found.text) is (stability is Stability.OPEN)
+    run_end = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
+    assert run_end.stability is stability
+    assert ("the loop changes until 39 s" in run_end.text) is (stability is Stability.OPEN)

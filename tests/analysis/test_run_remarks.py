@@ -8,7 +8,7 @@ from trilat_net.net.messages import State
 
 
 @pytest.mark.parametrize("ticks", [1, 7, 40])
-def test_times_at_the_torque_limit_are_counted_by_site(ticks: int) -> None:
+def test_ticks_at_the_torque_limit_are_counted(ticks: int) -> None:
     log = logs.simulated("paper")  # 200 Hz
     limits_nm = {site: log.scenario.sites[site].limits.tau_limit_nm for site in log.sites}
 
@@ -17,13 +17,13 @@ def test_times_at_the_torque_limit_are_counted_by_site(ticks: int) -> None:
             return row
         return logs.replaced(row, tau=[0.0, limits_nm[row.site]])
 
-    found = list_remarks(logs.rewritten(log, change=saturate))
+    remarks = list_remarks(logs.rewritten(log, change=saturate))
     times = f"{ticks / 200:.3g} s and {2 * ticks / 200:.3g} s"
-    assert found == (f"m1 and m2 were at their torque limit for {times}",)
+    assert remarks == (f"m1 and m2 were at their torque limit for {times}",)
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_pushes_above_half_of_the_limit_are_named(share: float) -> None:
+def test_pushes_above_half_the_limit_are_named(share: float) -> None:
     log = logs.simulated("paper")
     limit_nm = log.scenario.sites["m2"].limits.tau_limit_nm
     push_nm = share * LARGE_PUSH_SHARE * limit_nm
@@ -34,8 +34,8 @@ def test_pushes_above_half_of_the_limit_are_named(share: float) -> None:
         ),
     )
     limit = f"(torque limit {limit_nm:g} N m)"
-    words = f"hands or walls pushed m2 joint 1 with up to {push_nm:.3g} N m {limit}"
-    assert list_remarks(pushed) == ((words,) if share > 1.0 else ())
+    remark = f"hands or walls pushed m2 joint 1 with up to {push_nm:.3g} N m {limit}"
+    assert list_remarks(pushed) == ((remark,) if share > 1.0 else ())
 
 
 def test_late_ticks_are_counted() -> None:

@@ -1,4 +1,4 @@
-"""What `info` counts: messages, gaps and the time between them, without decoding any."""
+"""The counts of `info`: messages, gaps and the time between messages, without decoding."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from . import logs
 
 
 def strict(facts):
-    """As another program reads it; NaN and arrays are errors."""
+    """Parses JSON as strict programs do; NaN and arrays are errors."""
     return json.loads(json.dumps(facts, allow_nan=False))
 
 
@@ -64,7 +64,7 @@ def test_a_run_settles_with_its_last_site():
     assert facts["settle_s"] == 250 / 200
 
 
-def test_times_of_the_loop():
+def test_loop_times_are_summarised():
     facts = summarise_run(logs.timed(logs.simulated("four")))
     site = facts["sites"]["c"]  # 200 Hz: 400 ticks, late by 0 to 399 us
     assert site["late_us"]["p50"] == 199.5
@@ -99,7 +99,7 @@ def test_saturation_is_counted():
     assert summarise_run(logs.rewritten(log, change=cut))["sites"]["m1"]["saturated_ticks"] == 5
 
 
-def test_a_run_that_diverged_says_so_and_misses_nothing():
+def test_divergence_is_reported_without_missing_records():
     facts = strict(summarise_run(logs.diverged()))
     assert facts["diverged"] is True
     assert facts["missing"] == 0
@@ -110,7 +110,7 @@ def test_a_run_that_diverged_says_so_and_misses_nothing():
     )
 
 
-def test_a_site_that_holds_at_the_end_has_not_diverged():
+def test_a_held_site_has_not_diverged():
     def hold(state):
         return logs.replaced(state, mode="hold" if state.tick > 350 else "run")
 
@@ -119,13 +119,13 @@ def test_a_site_that_holds_at_the_end_has_not_diverged():
     assert facts["sites"]["m1"]["modes"] == [{"mode": "hold", "from_s": 351 / 200, "to_s": 2.0}]
 
 
-def test_what_was_changed_is_told_with_who_asked():
+def test_changes_are_reported_with_their_author():
     facts = strict(summarise_run(logs.busy().log))
-    told = [
+    changes = [
         (c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"])
         for c in facts["changes"]
     ]
-    assert told == [
+    assert changes == [
         (1.0, "a->c", "90 ms, loss 10 %", "c", None),
         (3.0, "c->a", "uniform 30 +- 17.3 ms", "a", 500),
         (4.0, "shares of c", "a 0.9, b 0.1 within 1 s", "c", None),
@@ -133,7 +133,7 @@ def test_what_was_changed_is_told_with_who_asked():
     assert [s["from_s"] for s in facts["links"]["c->a"]["stated"]] == [0.0, 3.0]
 
 
-def test_a_measured_link_states_nothing():
+def test_a_measured_link_states_no_delay():
     log = trilat_net.simulate(
         "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
     )
@@ -178,7 +178,7 @@ STATE = "/trilat/paper/m1/state"
 RATES = {"m1": 1000, "m2": 1000, "s": 1000}
 
 
-def written(folder: Path, data: bytes) -> Path:
+def write_log(folder: Path, data: bytes) -> Path:
     path = folder / "run.mcap"
     path.write_bytes(data)
     return path
@@ -186,9 +186,9 @@ def written(folder: Path, data: bytes) -> Path:
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sets(st.integers(0, 119), max_size=100))
-def test_gaps_are_the_records_that_are_not_there(tmp_path: Path, lost: set[int]) -> None:
-    """But for those behind the last one, which no number tells of."""
-    path = written(tmp_path, edited(WHOLE, record=without("m1", lost)))
+def test_gaps_count_missing_records(tmp_path: Path, lost: set[int]) -> None:
+    """Records missing behind the last one do not count, because no number reveals them."""
+    path = write_log(tmp_path, edited(WHOLE, record=without("m1", lost)))
     facts = FileInventory([path]).channels("paper", RATES, {})[STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
@@ -210,19 +210,21 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
     assert info(*paths).facts["sites"]["m1"]["missing"] == 0
 
 
-def test_progress_runs_once_through_all(tmp_path: Path) -> None:
-    told: list[float] = []
-    info(written(tmp_path, WHOLE), progress=lambda done, total: told.append(done / total))
-    assert told == sorted(told)
-    assert 0.0 < told[0] < 0.5 < told[-1] <= 1.0
+def test_progress_covers_the_file_once(tmp_path: Path) -> None:
+    fractions: list[float] = []
+    info(
+        write_log(tmp_path, WHOLE), progress=lambda done, total: fractions.append(done / total)
+    )
+    assert fractions == sorted(fractions)
+    assert 0.0 < fractions[0] < 0.5 < fractions[-1] <= 1.0
 
 
-def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
         FileInventory([tmp_path])
 
 
-def test_ticks_made_are_those_of_a_sites_last_start() -> None:
+def test_ticks_are_those_of_the_last_start() -> None:
     log = opened(recorded("two_sites", {"duration_s": 0.2}))
     last = next(event for event in log.events if (event.kind, event.member) == ("end", "s"))
     log.events.insert(0, msgspec.structs.replace(last, ticks=30, t_ns=0))

@@ -1,4 +1,4 @@
-"""What the words stable, settled, not stable and open rest on (docs/reference/stability.md)."""
+"""The basis of the words stable, settled, not stable and open (docs/reference/stability.md)."""
 
 import math
 
@@ -60,7 +60,7 @@ def test_stable_needs_a_proof() -> None:
     assert decide(proofs=[THEOREM]).stability is Stability.STABLE
 
 
-def test_decision_says_what_it_rests_on() -> None:
+def test_the_decision_names_its_basis() -> None:
     assert decide(roots=STABLE_ROOTS).rests_on == "exact roots, slowest -0.163 /s"
     both = decide(roots=STABLE_ROOTS, proofs=[THEOREM])
     assert both.rests_on == f"{THEOREM}; exact roots, slowest -0.163 /s"
@@ -74,7 +74,7 @@ def test_decision_says_what_it_rests_on() -> None:
 @pytest.mark.parametrize(
     "roots", [STABLE_ROOTS._replace(exact=False), STABLE_ROOTS._replace(verdict="at the edge")]
 )
-def test_roots_that_are_not_exact_or_not_stable_prove_nothing(roots: LoopRoots) -> None:
+def test_inexact_or_unstable_roots_prove_nothing(roots: LoopRoots) -> None:
     assert decide(twins=pushed(), roots=roots).stability is Stability.SETTLED
 
 
@@ -82,7 +82,7 @@ def test_roots_that_are_not_exact_or_not_stable_prove_nothing(roots: LoopRoots) 
     "behaviour", [b for b in EndBehaviour if b is not EndBehaviour.DIVERGED]
 )
 def test_exact_roots_exclude_the_opposite_word(behaviour: EndBehaviour) -> None:
-    """Whatever the end and the twins of a run within its limits look like."""
+    """This holds for any end and any twins of a run within its limits."""
     for twins in (None, pushed(), GROWING, pushed(EnvelopeTrend.STEADY, 0.0)):
         stable = decide(end=end(behaviour), twins=twins, roots=STABLE_ROOTS)
         assert stable.stability is not Stability.NOT_STABLE
@@ -91,7 +91,7 @@ def test_exact_roots_exclude_the_opposite_word(behaviour: EndBehaviour) -> None:
         assert unstable.rests_on == "exact roots, fastest growing +0.0424 /s"
 
 
-def test_unstable_roots_of_a_distant_rest_are_a_doubt() -> None:
+def test_unstable_roots_of_distant_rest_raise_doubt() -> None:
     """The run may come to rest in another pose, whose roots may be stable."""
     distant = UNSTABLE_ROOTS._replace(distance_rad=0.3)
     decision = decide(twins=pushed(), roots=distant)
@@ -102,7 +102,7 @@ def test_unstable_roots_of_a_distant_rest_are_a_doubt() -> None:
     )
 
 
-def test_diverged_run_is_not_stable_whatever_proves_it() -> None:
+def test_a_diverged_run_is_never_stable() -> None:
     diverged = end(EndBehaviour.DIVERGED, diverged_at_s=3.0)
     decision = decide(end=diverged, twins=pushed(), roots=STABLE_ROOTS, proofs=[THEOREM])
     assert decision.stability is Stability.NOT_STABLE
@@ -111,7 +111,7 @@ def test_diverged_run_is_not_stable_whatever_proves_it() -> None:
 @pytest.mark.parametrize(
     "behaviour", [EndBehaviour.BOUNDED, EndBehaviour.DRIFTS, EndBehaviour.GROWS]
 )
-def test_end_that_is_not_stable_stands_unless_pushes_contradict_it(
+def test_unstable_ends_stand_unless_pushes_contradict(
     behaviour: EndBehaviour,
 ) -> None:
     bad = end(behaviour)
@@ -122,7 +122,7 @@ def test_end_that_is_not_stable_stands_unless_pushes_contradict_it(
     assert decide(end=bad, twins=beat).stability is Stability.OPEN
 
 
-def test_few_bursts_of_loss_do_not_decide_unless_pushes_grow() -> None:
+def test_few_loss_bursts_need_growing_pushes() -> None:
     bad = end(EndBehaviour.BOUNDED)
     steady = pushed(EnvelopeTrend.STEADY, 0.01, burst_interval_s=3.0)
     decision = decide(end=bad, twins=steady)
@@ -134,14 +134,14 @@ def test_few_bursts_of_loss_do_not_decide_unless_pushes_grow() -> None:
     assert decide(end=bad, twins=growing).stability is Stability.NOT_STABLE
 
 
-def test_operator_who_acts_leaves_a_run_open() -> None:
+def test_an_acting_operator_leaves_a_run_open() -> None:
     acting = end(operator_acts=True, reasons=("an operator acts",))
     for roots in (None, STABLE_ROOTS, UNSTABLE_ROOTS):
         assert decide(end=acting, twins=GROWING, roots=roots).stability is Stability.OPEN
 
 
-def test_slow_run_agrees_with_a_root_that_its_slowest_push_confirms() -> None:
-    """P+d at 190 ms and d = 0.93: -0.00134 /s, of which 40 s show a factor of 0.97."""
+def test_slow_runs_agree_with_confirmed_slow_roots() -> None:
+    """P+d at 190 ms and d = 0.93: -0.00134 /s, for which 40 s show a factor of 0.97."""
     slow_root = STABLE_ROOTS._replace(rate_per_s=-0.00134)
     swinging = end(EndBehaviour.BOUNDED)
     confirming = pushed(EnvelopeTrend.STEADY, -0.00131)
@@ -152,7 +152,7 @@ def test_slow_run_agrees_with_a_root_that_its_slowest_push_confirms() -> None:
     assert "a run of 4.14e+03 s would" in open_run.reasons[0]
 
 
-def test_departure_from_a_rest_is_not_stable_without_a_proof() -> None:
+def test_departure_from_rest_needs_proof_for_stable() -> None:
     leaving = pushed(departure=RestDeparture(1.0, 9.0, 0.3, "m joint 1"))
     assert decide(twins=leaving).stability is Stability.NOT_STABLE
     assert decide(twins=leaving, roots=STABLE_ROOTS).stability is not Stability.NOT_STABLE
@@ -167,8 +167,8 @@ def test_doubts_and_hidden_periods_leave_a_run_open() -> None:
     assert decide(twins=hidden, roots=STABLE_ROOTS).stability is Stability.STABLE
 
 
-def test_inexact_unstable_roots_are_a_doubt_unless_twins_exclude_their_rate() -> None:
-    """Pushes that die away over 10 s exclude growth by a hundredfold: 0.46 /s."""
+def test_twins_may_exclude_inexact_unstable_roots() -> None:
+    """Pushes that decay over 10 s exclude growth by a hundredfold: 0.46 /s."""
     slow = UNSTABLE_ROOTS._replace(exact=False)
     assert decide(twins=pushed(), roots=slow).stability is Stability.OPEN
     fast = slow._replace(rate_per_s=0.5)

@@ -1,4 +1,4 @@
-"""What happened besides ticks: changes, modes."""
+"""Changes and modes over time."""
 
 import pytest
 from hypothesis import given
@@ -17,15 +17,15 @@ from . import logs
 
 
 @given(st.lists(st.sampled_from(list(MODES)), max_size=60))
-def test_spans_are_ticks_at_which_site_did_not_follow(modes):
+def test_spans_are_ticks_of_not_following(modes):
     part = logs.in_modes(modes)
-    away = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
-    found = [
+    spans = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
+    intervals = [
         (span.mode, k)
         for span in find_mode_intervals(part)
         for k in range(round(span.from_s * part.rate_hz), round(span.to_s * part.rate_hz))
     ]
-    assert found == away
+    assert intervals == spans
     for before, after in zip(
         find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False
     ):
@@ -37,7 +37,7 @@ def test_spans_are_ticks_at_which_site_did_not_follow(modes):
     assert (part.diverged_s is None) == (modes[-1:] != ["diverged"])
 
 
-def test_what_is_stated_of_a_link_changes_with_it():
+def test_stated_link_settings_follow_changes():
     log = logs.busy().log
     assert [
         (s.from_s, s.link.describe())
@@ -53,7 +53,7 @@ def test_what_is_stated_of_a_link_changes_with_it():
 @pytest.mark.parametrize(
     "text", ["nonsense", '{"at_s": 1.0, "link": "a->c", "to": {"model": "none"}}']
 )
-def test_a_record_that_names_a_foreign_change_is_refused(text):
+def test_a_record_naming_a_foreign_change_is_refused(text):
     def spoiled(state):
         return logs.replaced(
             state, cmd=[text] if (state.site, state.tick) == ("a", 3) else state.cmd

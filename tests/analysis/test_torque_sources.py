@@ -1,4 +1,4 @@
-"""What hands and environments do, over all rows, is what the integrator's own functions do at each."""
+"""Torques of hands and environments over all rows equal the integrator's own functions at each row."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def actors(draw: st.DrawFn) -> TorqueSource:
 
 @settings(max_examples=60, deadline=None)
 @given(actors(), st.lists(st.tuples(st.floats(0.0, 4.0), pairs, pairs), min_size=1, max_size=5))
-def test_every_actor_does_what_the_core_says(
+def test_every_torque_equals_the_cores(
     actor: TorqueSource, states: list[tuple[float, tuple, tuple]]
 ) -> None:
     lengths = (0.8, 0.6)
@@ -56,13 +56,13 @@ def test_every_actor_does_what_the_core_says(
         expected[n] = exogenous.source_torque(
             float(t_s[n]), q[n], qd[n], lengths, rows[0], table
         )[:2]
-    found = compute_source_torque(
+    torque = compute_source_torque(
         actor, t_s, q, qd, PlanarArmRows(np.zeros(5), 0.0, lengths).place_end_effector(q, qd)
     )
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_hands_and_environment_are_told_apart_and_make_up_record() -> None:
+def test_hand_and_environment_torques_sum_to_the_record() -> None:
     log = runs.run("rich").log
     for site, track in align_records(log).items():
         by = attribute_torque(track, log.scenario)
@@ -73,7 +73,7 @@ def test_hands_and_environment_are_told_apart_and_make_up_record() -> None:
         assert by.script is not None  # every hand did what the scenario says
 
 
-def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
+def test_an_unscripted_hand_has_no_script() -> None:
     log = runs.run("rich").log
     track = align_records(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
@@ -81,7 +81,7 @@ def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
 
 
 @pytest.mark.parametrize("acts", [TorqueKind.HAND, TorqueKind.TASK_HAND])
-def test_a_script_is_its_torque_at_a_fixed_pose(acts: TorqueKind) -> None:
+def test_scripts_are_torques_at_a_fixed_pose(acts: TorqueKind) -> None:
     actor = TorqueSource(
         acts, 0.0, 9.0, 1.0, 3.0, (0.1, 0.2), (0.5, -0.4), (50.0, 20.0), (5.0, 2.0)
     )

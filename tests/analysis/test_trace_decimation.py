@@ -38,7 +38,7 @@ def test_the_ends_stay_and_the_rest_is_bounded(values, buckets):
     assert len(keep) <= max(2 * buckets, 2 * values.shape[1] * buckets + 2)
 
 
-def test_a_spike_of_one_tick_in_a_million_survives():
+def test_a_spike_of_one_tick_survives():
     values = np.zeros((1_000_000, 1))
     values[654_321] = -3.0
     tick = np.arange(1_000_000)
@@ -48,7 +48,7 @@ def test_a_spike_of_one_tick_in_a_million_survives():
     assert trace.t_s[trace.values[:, 0].argmin()] == 654.321
 
 
-def test_line_is_broken_in_gap_that_can_be_seen():
+def test_visible_gaps_break_the_line():
     tick = np.concatenate([np.arange(100), np.arange(900, 1000)])
     trace = decimate(tick, tick * 1e-3, np.ones((200, 2)), 50)
     (gap,) = np.flatnonzero(np.isnan(trace.values).any(axis=1))
@@ -64,6 +64,6 @@ def test_gaps_narrower_than_a_bucket_break_nothing():
     assert np.isfinite(trace.values).all()
 
 
-def test_nothing_stays_nothing():
+def test_an_empty_trace_stays_empty():
     trace = decimate(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)), 10)
     assert trace.values.shape == (0, 2)

@@ -1,4 +1,4 @@
-"""What is said of a difference is what it does: its rate, its factor, and where."""
+"""The description of a difference matches its construction: rate, factor and place."""
 
 import math
 
@@ -22,7 +22,7 @@ JOINTS = ("m joint 1", "m joint 2", "s joint 1", "s joint 2")
 
 
 def difference(rate_per_s: float, omega_rad_s: float = 7.0, seconds: float = 20.0) -> Twins:
-    """One mode of a difference, largest at s joint 1, which is made small again all the time."""
+    """Returns one mode of a difference, largest at s joint 1, which is rescaled again and again."""
     t_s = np.arange(int(20 * seconds)) / 20.0 + 0.05
     shape = np.array([0.2, 0.1, 1.0, 0.5])
     last, scale = 1e-6 * np.cos(omega_rad_s * t_s)[:, np.newaxis] * shape, rate_per_s * t_s
@@ -36,11 +36,11 @@ def grown(rate_per_s: float) -> TwinGrowth:
 
 
 @pytest.mark.parametrize("rate_per_s", [-0.55, -0.02, 0.0, 0.02, 0.55])
-def test_the_rate_of_a_mode_is_found_without_its_swing(rate_per_s: float) -> None:
-    found = grown(rate_per_s).pushes[0]
-    assert found.rate_per_s == pytest.approx(rate_per_s, abs=2e-3)
-    assert found.factor == pytest.approx(math.exp(10.0 * rate_per_s), rel=0.05)
-    assert found.joint == "s joint 1"
+def test_rate_of_modes_is_found_without_swing(rate_per_s: float) -> None:
+    growth = grown(rate_per_s).pushes[0]
+    assert growth.rate_per_s == pytest.approx(rate_per_s, abs=2e-3)
+    assert growth.factor == pytest.approx(math.exp(10.0 * rate_per_s), rel=0.05)
+    assert growth.joint == "s joint 1"
 
 
 def test_the_words_follow_the_trend() -> None:
@@ -61,14 +61,14 @@ def test_the_words_follow_the_trend() -> None:
     assert texts[2].endswith(f"({rates[2]:+.3g} /s), most at s joint 1")
 
 
-def test_a_number_beyond_all_numbers_is_null() -> None:
+def test_infinite_numbers_are_null() -> None:
     row = grown(80.0).to_json()["pushes"][0]
     assert (row["becomes_rad_s"], row["factor"]) == (None, None)
     assert row["rate_per_s"] == pytest.approx(80.0, rel=0.05)
 
 
 def of_joints(*rates_per_s: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)) -> Twins:
-    """Two twins in which every joint has a mode of its own, with its own rate and size."""
+    """Returns two twins in which every joint has a mode of its own, with its own rate and size."""
     t_s = np.arange(400) / 20.0 + 0.05
     log_sizes = np.log(1e-6 * np.array(sizes)) + np.outer(t_s, rates_per_s)
     last = np.exp(log_sizes) * np.cos(7.0 * t_s)[:, np.newaxis]
@@ -80,7 +80,7 @@ def of_joints(*rates_per_s: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0, 1.
     return Twins(paths, JOINTS, np.full((len(t_s), 4), 1e-3), True)
 
 
-def test_slow_growth_of_a_joint_is_seen_beside_faster_decay_of_another() -> None:
+def test_slow_growth_shows_beside_faster_decay() -> None:
     """m joint 1 grows by 0.02 /s from a thousandth of the size of the others, which decay."""
     sizes = (1e-3, 1.0, 1.0, 1.0)
     growth = judge_twins(TWO, of_joints(0.02, -0.3, -0.3, -0.3, sizes=sizes), 0.0, math.inf)
@@ -91,7 +91,7 @@ def test_slow_growth_of_a_joint_is_seen_beside_faster_decay_of_another() -> None
     assert growth.grows is growth.worst.leads
 
 
-def test_joint_that_grows_and_is_fastest_makes_pushes_grow() -> None:
+def test_one_growing_joint_makes_pushes_grow() -> None:
     growth = judge_twins(TWO, of_joints(0.02, -2.0, -2.0, -2.0), 0.0, math.inf)
     assert growth.grows
     still = judge_twins(TWO, of_joints(-0.3, -2.0, -2.0, -2.0), 0.0, math.inf)
@@ -99,7 +99,7 @@ def test_joint_that_grows_and_is_fastest_makes_pushes_grow() -> None:
     assert not still.grows
 
 
-def test_part_of_a_period_is_no_trend() -> None:
+def test_part_of_a_period_has_no_trend() -> None:
     """The delays of this scenario repeat after 145.2 s: 1.20 s and 1.21 s."""
     sines = {
         "links.m->s": {
@@ -121,7 +121,7 @@ def test_part_of_a_period_is_no_trend() -> None:
     assert "145.2 s" in growth.period_text
 
 
-def test_random_directions_miss_a_growing_mode_with_this_probability() -> None:
+def test_random_directions_rarely_miss_a_growing_mode() -> None:
     """A mode with less than a hundredth of its usual share in each of n directions."""
     generator = np.random.default_rng(1)
     mode = generator.standard_normal(30)
@@ -133,14 +133,15 @@ def test_random_directions_miss_a_growing_mode_with_this_probability() -> None:
 
 
 @pytest.mark.long
-def test_twins_tell_what_is_linear_from_what_is_not() -> None:
-    """A pendulum's swing of 1 rad is another motion than a thousand of 1 mrad."""
+def test_twins_separate_linear_and_nonlinear_motion() -> None:
+    """The difference of a pendulum's swing for 1 rad is not a thousand times that for 1 mrad."""
     log = tn.simulate("p_d_margin", duration_s=8.0)
-    found = tn.twin(log, 2.0, {"m1.q1": 1e-6}, "1e-8:1")
-    assert found.linear is not None
-    assert found.linear.smallest == 1e-8
-    assert 1e-4 <= found.linear.largest <= 0.1
+    twin_report = tn.twin(log, 2.0, {"m1.q1": 1e-6}, "1e-8:1")
+    assert twin_report.linear is not None
+    assert twin_report.linear.smallest == 1e-8
+    assert 1e-4 <= twin_report.linear.largest <= 0.1
     assert (
-        f"; a push of {10 * found.linear.largest:g} goes another way: x " in found.linear.text
+        f"; a push of {10 * twin_report.linear.largest:g} goes another way: x "
+        in twin_report.linear.text
     )
-    assert len(found.to_frame()) == 9
+    assert len(twin_report.to_frame()) == 9

@@ -82,7 +82,9 @@ SEEDS = 2000
 def two_pairs(
     laws: tuple[Any, Any], q1_rad: tuple[float, ...], across: float = 0.0, **more: Any
 ) -> Scenario:
-    """{a, b} and {c, e}, each pair under one of two laws; `across` is the share of the other pair."""
+    """Returns {a, b} and {c, e}, each pair under one of two laws; `across` is the share of the
+    other pair.
+    """
     sites = {
         name: {
             "role": "master" if name in "ac" else "slave",
@@ -95,8 +97,8 @@ def two_pairs(
     dominance = {
         i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()
     }
-    given = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
-    return experiment("pairs", **{**given, **more})
+    keys = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
+    return experiment("pairs", **{**keys, **more})
 
 
 class Row(NamedTuple):
@@ -155,14 +157,14 @@ def _margin(
     T_ms: float = 200.0,
     **more: Any,
 ) -> Callable[[], Scenario]:
-    given = {
+    keys = {
         "control.d": d,
         "link.delay_ms": T_ms,
         "rate_hz": 100,
         "duration_s": 40.0,
         **(overrides or {}),
     }
-    return _load("p_d_margin", given, **more)
+    return _load("p_d_margin", keys, **more)
 
 
 WIDER = [swinging([(0.0, 0.0), (39.98, 12.0)])]
@@ -196,7 +198,7 @@ STIFF = {"control.K": 100.0, "control.d": 200.0, "rate_hz": 1000, "duration_s": 
 
 
 def _slower_from(at_s: float, d: float) -> Callable[[], Scenario]:
-    """P+d whose delay becomes longer, on links that lose a sample now and then."""
+    """Returns P+d whose delay becomes longer, on links that lose a sample now and then."""
     to = {"delay_ms": 900.0, "loss": 1e-6}
     later = [
         {"at_s": at_s, "link": link, "to": to} for link in load_scenario("p_d_margin").links
@@ -205,7 +207,7 @@ def _slower_from(at_s: float, d: float) -> Callable[[], Scenario]:
 
 
 def _touched(across: float) -> Callable[[], Scenario]:
-    """Two pairs of arms, of which a hand touches one, weakly."""
+    """Returns two pairs of arms, one of which a hand touches weakly."""
     hand = {"kind": "spring", "to_rad": [0.9, 0.9], "stiffness_nm_rad": 0.01}
     return lambda: load_scenario(two_pairs(LEARNT, APART, across), {"sites.a.hands": [hand]})
 
@@ -213,11 +215,11 @@ def _touched(across: float) -> Callable[[], Scenario]:
 def _swinging(
     name: str, d: float, period_s: float, swing_ms: float = 195.0, **more: Any
 ) -> Callable[[], Scenario]:
-    """P+d whose delay of 200 ms swings, from starts that are 1e-9 rad apart."""
+    """Returns P+d whose delay of 200 ms swings, from starts that are 1e-9 rad apart."""
     names = ("m1", "m2", "s") if name == "p_d_margin" else ("m", "s")
     starts = {
-        f"sites.{one}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)]
-        for n, one in enumerate(names)
+        f"sites.{site}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)]
+        for n, site in enumerate(names)
     }
     link = {
         "link.model": "sine",
@@ -233,7 +235,9 @@ def _swinging(
 def _turntables(
     d: float, period_s: float, c: tuple[float, float] = (0.88, 0.12)
 ) -> Callable[[], Scenario]:
-    """Three arms of one joint about an upright axis, 0.3 rad apart; `c` has the shares of the last."""
+    """Returns three arms of one joint about an upright axis, 0.3 rad apart; `c` has the shares
+    of the last.
+    """
     rows = {
         "a": {"b": 0.12, "c": 0.88},
         "b": {"a": 0.53, "c": 0.47},
@@ -245,9 +249,9 @@ def _turntables(
     }
     link = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 199.0, "period_s": period_s}
     arm = {"urdf": "arm6.urdf", "tip": "shoulder", "armature_kg_m2": 2.5}
-    law, given = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
+    law, keys = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
     return lambda: experiment(
-        "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **given
+        "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **keys
     )
 
 
@@ -255,12 +259,12 @@ def pair(first: Any, second: Any, **more: Any) -> Scenario:
     """Two sites that follow each other."""
     sites = {"a": {"role": "master", "q0_rad": [0.3, 0.4], **first}}
     sites["b"] = {"role": "slave", "q0_rad": [0.3, 0.4], **second}
-    given = {
+    keys = {
         "scheme": "digital",
         "sites": sites,
         "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}},
     }
-    return experiment("pair", **{**given, **more})
+    return experiment("pair", **{**keys, **more})
 
 
 def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[], Scenario]:
@@ -275,19 +279,21 @@ def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[],
 def _reserve(
     reserve_J: float, K: float, B: float, damped: float = 0.0, apart_rad: float = 1e-10
 ) -> Callable[[], Scenario]:
-    """Passivity control with a reserve, from starts next to each other; at arms that something resists."""
+    """Returns passivity control with a reserve, from starts next to each other; something
+    resists the arms.
+    """
     law = {"law": "tdpa", "K": K, "B": B, "reserve_J": reserve_J}
     around = (
         {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
     )
-    made = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
+    keys = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
     return lambda: load_scenario(
-        pair(around, around, **made), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
+        pair(around, around, **keys), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
     )
 
 
 def _held_apart(stiffness_nm_rad: float, by_rad: float) -> Callable[[], Scenario]:
-    """Two pairs that hardly hear of each other; a hand holds one arm of each where it stands."""
+    """Returns two pairs that are hardly coupled; a hand holds one arm of each pair at its start."""
 
     def make() -> Scenario:
         starts = tuple(q if q > 0.0 else q - by_rad for q in APART)
@@ -308,25 +314,27 @@ def _held_apart(stiffness_nm_rad: float, by_rad: float) -> Callable[[], Scenario
 
 
 def _wave(b: float, K: float, damped: float = 0.0) -> Callable[[], Scenario]:
-    """Wave variables between arms that start at rest, next to each other; at arms that something resists."""
+    """Returns wave variables between arms that start at rest, next to each other; something
+    resists the arms.
+    """
     law = {"law": "wave", "b": b, "K": K, "B": 0.1 * K}
     around = (
         {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
     )
-    made = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
-    return lambda: pair(around, around, **made)
+    keys = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
+    return lambda: pair(around, around, **keys)
 
 
 def _coasting(follows: dict[str, float], law: str = "tdpa") -> Callable[[], Scenario]:
     """A user lets go of an arm that no spring holds, and the slave follows it."""
-    led = {"K": 40.0, "B": 5.0}
+    gains = {"K": 40.0, "B": 5.0}
     push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [0.4, 0.2]}
-    made = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
-    led = led if law in ("wave", "tdpa") else {**follows}
+    keys = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
+    gains = gains if law in ("wave", "tdpa") else {**follows}
     return lambda: pair(
         {"control": {"law": law, **follows}, "hands": [push]},
-        {"control": {"law": law, **led}},
-        **made,
+        {"control": {"law": law, **gains}},
+        **keys,
     )
 
 
@@ -560,7 +568,9 @@ ROWS = (
 
 
 def under_noise(scenario: Scenario) -> Scenario:
-    """An experiment with its delays, on links as of a live run: jitter of 1.5 ms, 1 % of samples lost."""
+    """Returns an experiment with its delays, on links as of a live run: jitter of 1.5 ms, 1 %
+    of samples lost.
+    """
     noise = {"model": "uniform", "half_width_ms": 1.5, "loss": 0.01}
     links = {
         f"links.{link}.{key}": value for link in scenario.links for key, value in noise.items()
@@ -570,7 +580,9 @@ def under_noise(scenario: Scenario) -> Scenario:
 
 
 class Truth(NamedTuple):
-    """What is true of a run: whether it is unstable, its rightmost root, 1/s, and whether an edge is near."""
+    """The truth about a run: whether it is unstable, its rightmost root, 1/s, and whether an
+    edge is near.
+    """
 
     unstable: bool
     root_per_s: float | None
@@ -578,10 +590,11 @@ class Truth(NamedTuple):
 
 
 def find_truth(drawn: Drawn) -> Truth:
-    """The truth by the rightmost root and by a run eight times as long, in which operators let go.
+    """Returns the truth by the rightmost root and by a run eight times as long, in which
+    operators let go.
 
-    Of random links the longer run alone decides.
-    See `find_wide_truth` for whatever was drawn widely.
+    For random links the longer run alone decides. `find_wide_truth` decides for widely drawn
+    runs.
     """
     if drawn.wide:
         return find_wide_truth(drawn.scenario)
@@ -605,7 +618,9 @@ def find_truth(drawn: Drawn) -> Truth:
     near = False
     if drawn.key and root is not None:
         beside = [_rightmost(_scaled(drawn, factor), at) for factor in NEAR_AN_EDGE]
-        near = any(one is not None and (one > 0.0) != (root > 0.0) for one in beside)
+        near = any(
+            exponent is not None and (exponent > 0.0) != (root > 0.0) for exponent in beside
+        )
     if run.diverged_s is not None:
         return Truth(True, root, near)
     early, late = (
@@ -643,7 +658,7 @@ def find_wide_truth(scenario: Scenario) -> Truth:
 
 
 def _largest_speed(run: FusedRun, until_s: float) -> float:
-    """The largest speed of any joint in the quarter of a run's own length before a time, rad/s."""
+    """Returns the largest speed of any joint in the quarter of a run's own length before a time, rad/s."""
     last = round(until_s * BUCKETS_PER_S)
     first = last - round(run.ran_s * BUCKETS_PER_S / LONGER / 4.0)
     return max(float(np.split(site[first:last], 3, axis=1)[1].max()) for site in run.buckets)
@@ -685,19 +700,23 @@ def measure_exponent(scenario: Scenario, until_s: float) -> float:
 
 
 def _largest_difference(run: FusedRun, pushed: FusedRun, start_s: float) -> float:
-    """The largest difference of the speeds of two runs in a window, which both make, rad/s."""
-    apart = []
+    """Returns the largest difference of the speeds of two runs in a window, rad/s; both runs
+    are continued.
+    """
+    differences = []
     for t_s in np.linspace(start_s, start_s + WINDOW_S, 21)[1:]:
         for one in (run, pushed):
             one.step_to(round(t_s * NS_PER_S))
-        apart.append(pushed.measure_distance(run, "qd"))
-    return max(apart)
+        differences.append(pushed.measure_distance(run, "qd"))
+    return max(differences)
 
 
 def has_sampled_wall(scenario: Scenario) -> bool:
     """True if a wall is held over a tick."""
     return any(
-        one.actor.sampled for spec in scenario.sites.values() for one in spec.environment
+        environment.actor.sampled
+        for spec in scenario.sites.values()
+        for environment in spec.environment
     )
 
 
@@ -721,7 +740,7 @@ def _rightmost(scenario: Scenario, at: Equilibrium) -> float | None:
 
 
 def _scaled(drawn: Drawn, factor: float) -> Scenario:
-    """The experiment with its key times a factor."""
+    """Returns the experiment with its key times a factor."""
     if drawn.key == STIFFNESS:
         value = drawn.scenario.sites["s"].environment[0].stiffness_n_m
         return load_scenario(drawn.scenario, {STIFFNESS: factor * value})
@@ -733,7 +752,7 @@ def _scaled(drawn: Drawn, factor: float) -> Scenario:
 
 
 def say_of(log: Log) -> str:
-    """The word of `trilat certify`."""
+    """Returns the word of `trilat certify`."""
     return str(trilat_net.certify(log).stability)
 
 
@@ -750,12 +769,12 @@ def say_of_run(scenario: Scenario) -> str:
 
 
 def say_of_sweep(scenario: Scenario) -> str:
-    """The word of a cell of `trilat sweep`."""
+    """Returns the word of a cell of `trilat sweep`."""
     return classify_cell(scenario.text, LONGER * scenario.duration_s).stability
 
 
 class Judged(NamedTuple):
-    """A drawn experiment, its truth, and what `certify` and a sweep say of it."""
+    """A drawn experiment, its truth, and the words of `certify` and of a sweep."""
 
     drawn: Drawn
     truth: Truth
@@ -764,24 +783,24 @@ class Judged(NamedTuple):
 
 
 def judge_experiment(seed: int, *, stored: bool = True) -> Judged:
-    """What is said of the experiment of a seed; its truth is read from `TRUTHS` if it is stored there."""
+    """Judges the experiment of a seed; its truth is read from `TRUTHS` if it is stored there."""
     drawn = draw_experiment(seed)
     truth = read_truth(seed, drawn) if stored else find_truth(drawn)
     return Judged(drawn, truth, say_of_run(drawn.scenario), say_of_sweep(drawn.scenario))
 
 
 def judge_hidden(seed: int) -> Judged:
-    """What is said of a loop that hides its growth, with its law allowed to run."""
+    """Judges a loop that hides its growth, with permission to run its law."""
     hidden, rate_per_s = draw_hidden(seed)
     drawn = Drawn(hidden.kind, write_scenario(hidden), has="hidden")
     truth = Truth(rate_per_s > 0.0, rate_per_s, abs(rate_per_s) < NEAR_PER_S)
     log = trilat_net.simulate(drawn.scenario)
-    found = trilat_net.certify(log, own_laws=hidden.own_law)
-    return Judged(drawn, truth, str(found.stability))
+    certificate = trilat_net.certify(log, own_laws=hidden.own_law)
+    return Judged(drawn, truth, str(certificate.stability))
 
 
 def read_truth(seed: int, drawn: Drawn) -> Truth:
-    """The truth of a seed, as it was stored for this very scenario."""
+    """Returns the truth of a seed, as stored for exactly this scenario."""
     digest, unstable, root_per_s, near = _read_rows()[seed]
     anew = "python -m tests.certificate.adversaries --find-truths"
     assert digest == _digest(drawn), (
@@ -796,7 +815,7 @@ def _read_rows() -> list[list[str]]:
 
 
 def count_stored() -> int:
-    """How many seeds have a stored truth."""
+    """Returns how many seeds have a stored truth."""
     return len(_read_rows())
 
 
@@ -805,7 +824,7 @@ def _digest(drawn: Drawn) -> str:
 
 
 def write_truth(seed: int) -> str:
-    """The row of a seed, its truth found anew."""
+    """Returns the row of a seed with its truth computed anew."""
     drawn = draw_experiment(seed)
     unstable, root, near = find_truth(drawn)
     root_per_s = "" if root is None else f"{root:.6g}"
@@ -825,8 +844,8 @@ class Tally(NamedTuple):
 
 
 def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
-    """Counts of what `by` says: wrongly stable, wrongly not, settled, and open."""
-    rows = [(one.truth, getattr(one, by)) for one in judged]
+    """Returns the counts of the words of `by`: wrongly stable, wrongly not, settled, and open."""
+    rows = [(entry.truth, getattr(entry, by)) for entry in judged]
     return Tally(
         len(rows),
         sum(truth.unstable for truth, _ in rows),
@@ -839,8 +858,8 @@ def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
 
 
 def tally_clear(judged: Iterable[Judged], by: str = "certified") -> Tally:
-    """The same, of those that are not near an edge."""
-    return tally((one for one in judged if not one.truth.near), by)
+    """Returns the same counts for experiments that are not near an edge."""
+    return tally((entry for entry in judged if not entry.truth.near), by)
 
 
 def main() -> None:
@@ -853,25 +872,25 @@ def main() -> None:
     parser.add_argument(
         "--find-truths", action="store_true", help="write those of truths.csv anew"
     )
-    asked = parser.parse_args()
-    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        if asked.find_truths:
+    arguments = parser.parse_args()
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        if arguments.find_truths:
             _write_truths(pool.map(write_truth, range(count_stored()), chunksize=8))
             return
-        drawn, hidden = DRAWN[: asked.seeds], HIDDEN[: asked.seeds]
+        drawn, hidden = DRAWN[: arguments.seeds], HIDDEN[: arguments.seeds]
         judged = [
             *pool.map(judge_by_certify, drawn, chunksize=8),
             *pool.map(judge_hidden, hidden, chunksize=8),
         ]
     print_table(judged)
     for seed, one in zip((*drawn, *hidden), judged, strict=True):
-        found = tally([one])
-        if found.false_ok or found.false_alarm:
+        counts = tally([one])
+        if counts.false_ok or counts.false_alarm:
             print(f"seed {seed}: {one.drawn.kind}, {one.truth}: {one.certified}")
 
 
 def judge_by_certify(seed: int) -> Judged:
-    """What `certify` alone says of the experiment of a seed."""
+    """Returns the word of `certify` alone on the experiment of a seed."""
     drawn = draw_experiment(seed)
     return Judged(drawn, read_truth(seed, drawn), say_of_run(drawn.scenario))
 
@@ -886,18 +905,20 @@ def _write_truths(rows: Iterable[str]) -> None:
 
 
 def print_table(judged: list[Judged]) -> None:
-    """Prints a row per kind, and one of all; and how often an error may happen that did not."""
+    """Prints a row per kind, and one of all; and the upper bound on the rate of errors that did
+    not occur.
+    """
     columns = "runs | unstable | near an edge | false ok | false alarms | settled | open"
     print(f"| experiments | {columns} |")
     print("|---|" + " --: |" * len(Tally._fields))
-    kinds = sorted({(one.drawn.has == "hidden", one.drawn.kind) for one in judged})
+    kinds = sorted({(entry.drawn.has == "hidden", entry.drawn.kind) for entry in judged})
     for hides, kind in kinds:
-        found = [
-            one
-            for one in judged
-            if (one.drawn.has == "hidden", one.drawn.kind) == (hides, kind)
+        groups = [
+            entry
+            for entry in judged
+            if (entry.drawn.has == "hidden", entry.drawn.kind) == (hides, kind)
         ]
-        print(f"| {kind} | " + " | ".join(map(str, tally(found))) + " |")
+        print(f"| {kind} | " + " | ".join(map(str, tally(groups))) + " |")
     total = tally(judged)
     print("| all | " + " | ".join(map(str, total)) + " |")
     print(

@@ -1,8 +1,9 @@
 """Experiments that are drawn from a seed, many of them near an edge of stability.
 
-Seeds below `WIDE_FROM` draw loops of a few kinds at rest poses well apart; from there on everything that a
-scenario may have is drawn: all laws, starts from 1e-10 to 1 rad apart, delays that swing, drift or were
-recorded, several tick rates, chains, task space, walls, hands that hold or let go.
+Seeds below `WIDE_FROM` draw loops of a few kinds at rest poses well apart. Larger seeds draw
+every feature of a scenario: all laws, starts from 1e-10 to 1 rad apart, delays that swing,
+drift or were recorded, several tick rates, chains, task space, walls, hands that hold or let
+go.
 """
 
 import json
@@ -23,13 +24,15 @@ SAMPLED = "sites.s.environment.0.sampled"
 
 
 def _toml(value: Any) -> str:
-    """A value in TOML; nine digits, since further ones of a sine or an eigenvalue depend on the machine."""
+    """Returns a value in TOML with nine digits, since further digits of a sine or an eigenvalue
+    depend on the machine.
+    """
     if isinstance(value, float):
         return json.dumps(float(f"{value:.9g}"))
     if isinstance(value, Mapping):
         return (
             "{ "
-            + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items())
+            + ", ".join(f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items())
             + " }"
         )
     if isinstance(value, list | tuple):
@@ -38,19 +41,19 @@ def _toml(value: Any) -> str:
 
 
 def experiment(name: str, **tables: Any) -> Scenario:
-    """The scenario of some tables."""
-    given = {
+    """Returns the scenario of some tables."""
+    keys = {
         "name": name,
         "rate_hz": 100,
         "duration_s": 30.0,
         "scheme": "second_order",
         **tables,
     }
-    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in given.items()))
+    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in keys.items()))
 
 
 def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[str, Any]:
-    """A hand whose torque swings on joint 1 and 2, its size linear between (time s, N m)."""
+    """Returns a hand whose torque swings on joint 1 and 2, its size linear between (time s, N m)."""
     times, sizes = np.array(list(peaks)).T
     t_s = np.arange(times[0], times[-1] + 1e-9, 0.02)
     torque = np.interp(t_s, times, sizes) * np.sin(2 * np.pi * hertz * t_s)
@@ -61,12 +64,14 @@ def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[s
 
 
 def p_d(d: Any, **more: Any) -> dict[str, Any]:
-    """P+d with 10 N m/rad."""
+    """Returns P+d with 10 N m/rad."""
     return {"law": "p_d", "K": 10.0, "d": d, **more}
 
 
 class Drawn(NamedTuple):
-    """An experiment that was drawn: its kind, its scenario, the key that may be near an edge, what it has."""
+    """An experiment that was drawn: its kind, its scenario, the key that may be near an edge,
+    and its features.
+    """
 
     kind: str
     scenario: Scenario
@@ -75,12 +80,12 @@ class Drawn(NamedTuple):
 
     @property
     def wide(self) -> bool:
-        """True if everything was drawn."""
+        """True if every feature was drawn."""
         return bool(self.has)
 
 
 def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str, Any]:
-    """Arms of several masses, about one pose."""
+    """Draws arms of several masses, about one pose."""
     pose = rng.uniform(-0.8, 0.8, 2)
     return {
         name: {
@@ -97,7 +102,7 @@ def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str,
 
 
 def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]:
-    """Shares of every site, of all of its peers or of one."""
+    """Draws shares of every site, of all of its peers or of one."""
     rows = {}
     for name in names:
         peers = [peer for peer in names if peer != name]
@@ -110,7 +115,7 @@ def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]
 
 
 def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
-    """A network of P+d or PD+d whose damping is about the edge of stability."""
+    """Draws a network of P+d or PD+d whose damping is about the edge of stability."""
     shares, T_ms, K = (
         _shares(rng, names),
         float(rng.uniform(80.0, 400.0)),
@@ -137,23 +142,23 @@ def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
 
 
 def _draw_network(rng: np.random.Generator) -> Drawn:
-    made = _loop(rng, "abce"[: rng.integers(2, 5)])
-    return Drawn("network", experiment("network", **made), "control.d")
+    loop_keys = _loop(rng, "abce"[: rng.integers(2, 5)])
+    return Drawn("network", experiment("network", **loop_keys), "control.d")
 
 
 def _draw_noisy(rng: np.random.Generator) -> Drawn:
-    made = _loop(rng, "abc"[: rng.integers(2, 4)])
-    made["link"] |= {
+    loop_keys = _loop(rng, "abc"[: rng.integers(2, 4)])
+    loop_keys["link"] |= {
         "model": "uniform",
-        "half_width_ms": min(3.0, made["link"]["delay_ms"]),
+        "half_width_ms": min(3.0, loop_keys["link"]["delay_ms"]),
         "loss": 0.02,
     }
-    return Drawn("noise", experiment("noise", **made), "control.d")
+    return Drawn("noise", experiment("noise", **loop_keys), "control.d")
 
 
 def _draw_groups(rng: np.random.Generator) -> Drawn:
-    """Two closed groups: what one does hides the other."""
-    made, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
+    """Draws two closed groups, one of which hides the motion of the other."""
+    keys, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
     d = 10.0 * T * rng.uniform([1.2, 0.7], [2.5, 1.3])
     sites = _sites(rng, "abce", 0.5)
     for n, name in enumerate("abce"):
@@ -161,29 +166,30 @@ def _draw_groups(rng: np.random.Generator) -> Drawn:
         if n >= 2:
             sites[name]["q0_rad"] = [0.1 + 1e-3 * n, 0.2]
     pairs = {"a": {"b": 1.0}, "b": {"a": 1.0}, "c": {"e": 1.0}, "e": {"c": 1.0}}
-    made |= {"sites": sites, "dominance": pairs, "link": {"delay_ms": 1e3 * T}}
-    return Drawn("groups", experiment("groups", **{**made, "control": p_d(1.0)}), "control.d")
+    keys |= {"sites": sites, "dominance": pairs, "link": {"delay_ms": 1e3 * T}}
+    return Drawn("groups", experiment("groups", **{**keys, "control": p_d(1.0)}), "control.d")
 
 
 def _draw_adaptive(rng: np.random.Generator) -> Drawn:
-    """The paper's law at rates at which sampling may feed it."""
+    """Draws the paper's law at rates at which sampling may feed it."""
     names = "abc"[: rng.integers(2, 4)]
     late = rng.random() < 0.6
-    made = _loop(
+    loop_keys = _loop(
         rng, names, link={"delay_ms": float(rng.uniform(20.0, 500.0)) if late else 0.0}
     )
-    made["control"] = {
+    loop_keys["control"] = {
         "law": "adaptive",
         "Kp": float(rng.uniform(0.5, 3.0)),
         "Kd": float(rng.uniform(1.0, 5.0)),
     }
     return Drawn(
-        "adaptive", experiment("adaptive", **{**made, "rate_hz": int(rng.choice([50, 100]))})
+        "adaptive",
+        experiment("adaptive", **{**loop_keys, "rate_hz": int(rng.choice([50, 100]))}),
     )
 
 
 def _draw_delay(rng: np.random.Generator) -> Drawn:
-    """A delay that swings about twice as fast as the loop does."""
+    """Draws a delay that swings about twice as fast as the loop does."""
     T = float(rng.uniform(100.0, 250.0))
     link = {
         "model": "sine",
@@ -191,10 +197,10 @@ def _draw_delay(rng: np.random.Generator) -> Drawn:
         "amplitude_ms": T * float(rng.choice([0.1, 0.9])),
         "period_s": 1.0 / rng.uniform(1.0, 2.5),
     }
-    made = _loop(rng, "abc", link=link)
+    loop_keys = _loop(rng, "abc", link=link)
     if rng.random() < 0.5:
-        made["control"] = {"law": "adaptive"}
-    return Drawn("delay", experiment("delay", **made))
+        loop_keys["control"] = {"law": "adaptive"}
+    return Drawn("delay", experiment("delay", **loop_keys))
 
 
 def _draw_wall(rng: np.random.Generator) -> Drawn:
@@ -202,26 +208,26 @@ def _draw_wall(rng: np.random.Generator) -> Drawn:
     edge = 15.5e3 * rate_hz / 1000
     K = edge * (rng.uniform(0.8, 1.2) if rng.random() < 0.5 else rng.uniform(0.2, 2.5))
     # The stored truths are those of the speed limit that `windup` had when they were found.
-    made = {
+    loop_keys = {
         SAMPLED: True,
         STIFFNESS: K,
         "rate_hz": rate_hz,
         "duration_s": DRAWN_S,
         "limits.qd_limit_rad_s": 100.0,
     }
-    return Drawn("wall", load_scenario("windup", made), STIFFNESS)
+    return Drawn("wall", load_scenario("windup", loop_keys), STIFFNESS)
 
 
 def _draw_operator(rng: np.random.Generator) -> Drawn:
-    """A hand that swings to the end, or lets go long before it."""
-    made = _loop(rng, "abc")
-    made["control"] = p_d(float(rng.uniform(2.0, 6.0)))
+    """Draws a hand that swings to the end, or lets go long before the end."""
+    loop_keys = _loop(rng, "abc")
+    loop_keys["control"] = p_d(float(rng.uniform(2.0, 6.0)))
     until_s = DRAWN_S - 0.02 if rng.random() < 0.5 else 0.3 * DRAWN_S
     hand = swinging(
         [(0.0, 0.0), (until_s, float(rng.uniform(2.0, 10.0)))], float(rng.uniform(0.3, 1.5))
     )
-    made["sites"]["a"]["hands"] = [hand]
-    return Drawn("operator", experiment("operator", **made))
+    loop_keys["sites"]["a"]["hands"] = [hand]
+    return Drawn("operator", experiment("operator", **loop_keys))
 
 
 KINDS: tuple[tuple[float, Callable[[np.random.Generator], Drawn]], ...] = (
@@ -263,12 +269,12 @@ _TYPICAL: Mapping[str, Mapping[str, float]] = {
 
 
 def _about(rng: np.random.Generator, value: float, factor: float = 2.0) -> float:
-    """A number within a factor of another."""
+    """Draws a number within a factor of another."""
     return float(f"{value * factor ** rng.uniform(-1.0, 1.0):.4g}")
 
 
 def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, Any]]:
-    """A law with its gains, of every site."""
+    """Draws a law with its gains, for every site."""
     gains: dict[str, Any] = {"law": law} | {
         key: _about(rng, x) for key, x in _TYPICAL[law].items()
     }
@@ -286,7 +292,7 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
         }
     if law == "wave" and rng.random() < 0.3:
         gains |= {"K": 0.0, "B": 0.0}
-    own: Callable[[int], dict[str, Any]] = {
+    settings: Callable[[int], dict[str, Any]] = {
         "authority": lambda n: {"leads": n < len(names) - 1},
         "impedance": lambda n: {"follows": n == len(names) - 1},
         "smith": lambda n: {"predicts": n == 0},
@@ -294,11 +300,11 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
             {"K": gains["K"], "k_f": 0.0} if n else {"K": 0.0, "k_f": gains["k_f"]}
         ),
     }.get(law, lambda _: {})
-    return [gains | own(n) for n in range(len(names))]
+    return [gains | settings(n) for n in range(len(names))]
 
 
 def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
-    """A link's name and its keys: constant, swinging, drifting, or as it was recorded."""
+    """Draws a link's name and its keys: constant, swinging, drifting, or recorded."""
     T_ms, kind = (
         round(float(rng.uniform(20.0, 250.0)), 1),
         str(rng.choice(["constant", "sine", "ar1", "trace"])),
@@ -332,7 +338,7 @@ def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
 
 
 def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
-    """Lets a hand hold, let go or push, or an environment resist; what it is."""
+    """Draws a hand that holds, lets go or pushes, or an environment that resists, and returns its kind."""
     names, to = list(sites), [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
     spring = {"kind": "spring", "to_rad": to, "stiffness_nm_rad": _about(rng, 30.0, 3.0)}
     spring |= {
@@ -371,7 +377,7 @@ _TOUCHES = (0.4, 0.12, 0.12, 0.08, 0.1, 0.1, 0.08)
 
 
 def _draw_wide(rng: np.random.Generator) -> Drawn:
-    """Anything that a scenario may have; what contradicts itself is drawn again."""
+    """Draws every feature of a scenario; contradictory draws are repeated."""
     while True:
         try:
             return _draw_anything(rng)
@@ -392,28 +398,28 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
             sites[name]["rate_hz"] = int(rng.choice([rate_hz // 2, rate_hz, 3 * rate_hz // 4]))
     link, keys = _draw_link(rng)
     touch = _draw_touch(rng, sites)
-    made: dict[str, Any] = {"link": keys, "dominance": _shares(rng, names)}
+    loop_keys: dict[str, Any] = {"link": keys, "dominance": _shares(rng, names)}
     starts = np.array(sites["a"]["q0_rad"]).round(3)
     if law in ("adaptive", "p_d", "pd_d") and rng.random() < 0.25:
-        made["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
+        loop_keys["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
         starts = np.array([0.2, 1.4])
     elif touch == "nobody" and rng.random() < 0.15 and law != "adaptive_kinematics":
-        made["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
+        loop_keys["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
         starts, space = np.array([0.2, -1.0, 1.2]), "chain"
         for name in names:
             del sites[name]["arm"]
             sites[name]["control"].pop("theta_hat0", None)
-    made |= {
+    loop_keys |= {
         "rate_hz": rate_hz,
         "duration_s": DRAWN_S,
         "scheme": str(rng.choice(["second_order", "digital"])),
     }
     if law in ("wave", "tdpa", "tanks"):
-        made["scheme"] = "digital"
+        loop_keys["scheme"] = "digital"
     for name in names:
         sites[name]["q0_rad"] = starts.tolist()
-    alike = experiment("wide", sites=sites, **made)
-    apart = {
+    alike = experiment("wide", sites=sites, **loop_keys)
+    start_keys = {
         f"sites.{name}.q0_rad": [
             float(q + round(spread * x, 13)) for q, x in zip(starts, row, strict=True)
         ]
@@ -421,11 +427,11 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
             names, rng.uniform(-1.0, 1.0, (len(names), len(starts))), strict=True
         )
     }
-    return Drawn(law, load_scenario(alike, apart), has=f"{link}, {touch}, {space}")
+    return Drawn(law, load_scenario(alike, start_keys), has=f"{link}, {touch}, {space}")
 
 
 def draw_experiment(seed: int) -> Drawn:
-    """The experiment of a seed."""
+    """Returns the experiment of a seed."""
     rng = np.random.default_rng(seed)
     if seed >= WIDE_FROM:
         return _draw_wide(rng)

@@ -62,15 +62,15 @@ class Hidden(NamedTuple):
 
     @property
     def loses(self) -> bool:
-        """True if its links lose samples."""
+        """True if the links of the loop lose samples."""
         return any(way.loss for way in self.loop.ways.values())
 
     def measure(self) -> float:
-        """Its rate of growth, 1/s."""
+        """Returns the rate of growth of the loop, 1/s."""
         return measure_growth(self.loop, RANDOM_SPAN_S if self.loses else SPAN_S)
 
     def scaled(self, factor: float) -> "Hidden":
-        """The same with another damping."""
+        """Returns the loop with its damping times a factor."""
         return self._replace(loop=self.loop._replace(damping=factor * self.loop.damping))
 
 
@@ -83,7 +83,7 @@ def _round(value: Any, digits: int = 6) -> Any:
 def _draw_arms(
     rng: np.random.Generator, count: int, pose: np.ndarray
 ) -> tuple[list[dict[str, float]], np.ndarray, np.ndarray]:
-    """Arms of unlike masses, and M and the gradient of gravity of each at the pose."""
+    """Draws arms of unlike masses, and M and the gradient of gravity of each at the pose."""
     arms, inertias, gravity = [], [], []
     for _ in range(count):
         m1, m2 = _round(np.exp(rng.uniform(-0.7, 0.7, 2)), 3)
@@ -107,7 +107,7 @@ def _draw_shares(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _draw_loop(rng: np.random.Generator, way: Callable[[], Way]) -> Hidden:
-    """Two or three arms under P+d, over links that `way` draws."""
+    """Draws two or three arms under P+d, over links that `way` draws."""
     count = int(rng.integers(2, 4))
     pose = _round(rng.uniform(-0.8, 0.8, 2), 3)
     arms, inertias, gravity = _draw_arms(rng, count, pose)
@@ -115,7 +115,7 @@ def _draw_loop(rng: np.random.Generator, way: Callable[[], Way]) -> Hidden:
     pairs = [(i, j) for i in range(count) for j in range(count) if shares[i, j] > 0.0]
     stiffness = float(_round(rng.uniform(8.0, 30.0), 3))
     ways = {pair: way() for pair in pairs}
-    mean_s = 1e-3 * np.mean([_mean_ms(one) for one in ways.values()])
+    mean_s = 1e-3 * np.mean([_mean_ms(link_way) for link_way in ways.values()])
     damping = 0.6 * stiffness * (mean_s + 1.0 / RATE_HZ)
     loop = Loop(
         inertias,
@@ -142,7 +142,7 @@ def _constant(rng: np.random.Generator) -> Way:
 
 
 def _draw_sinusoids(rng: np.random.Generator) -> Hidden:
-    """Every link has a period of its own, some almost the same as another's."""
+    """Draws delays in which every link has a period of its own, some almost the same as another's."""
     period_s = round(float(rng.uniform(0.8, 4.0)), 2)
 
     def way() -> Way:
@@ -157,7 +157,7 @@ def _draw_sinusoids(rng: np.random.Generator) -> Hidden:
 
 
 def _draw_traces(rng: np.random.Generator) -> Hidden:
-    """Looped tables that last from a tenth of the run to three times as long."""
+    """Draws looped tables that last from a tenth of the run to three times as long."""
     length_s = float(rng.choice([3.0, 7.5, 20.0, 45.0, 90.0]))
 
     def way() -> Way:
@@ -172,7 +172,7 @@ def _draw_traces(rng: np.random.Generator) -> Hidden:
 
 
 def _draw_slow_joint(rng: np.random.Generator) -> Hidden:
-    """The first joint moves much and decays fast; the second hardly moves."""
+    """Draws a loop whose first joint moves much and decays fast, and whose second joint hardly moves."""
     hidden = _draw_loop(rng, lambda: _constant(rng))
     damping = hidden.loop.damping * np.array([float(rng.uniform(2.0, 4.0)), 1.0])
     starts = hidden.starts_rad + np.array([1.0, 0.0]) * _round(
@@ -186,14 +186,14 @@ def _draw_slow_joint(rng: np.random.Generator) -> Hidden:
 
 
 def _draw_symmetric(rng: np.random.Generator) -> Hidden:
-    """All arms start at rest at one pose, so that nothing moves by itself."""
+    """Draws a loop whose arms all start at rest at one pose, so that nothing moves by itself."""
     hidden = _draw_loop(rng, lambda: _constant(rng))
     starts = np.tile(hidden.pose_rad, (len(hidden.arms), 1))
     return hidden._replace(starts_rad=starts, own_law=bool(rng.random() < 0.3))
 
 
 def _draw_command(rng: np.random.Generator) -> Hidden:
-    """A change during the run that changes nothing, or makes every delay longer or shorter."""
+    """Draws a change during the run that changes nothing, or makes every delay longer or shorter."""
     hidden = _draw_loop(rng, lambda: _constant(rng))
     at_s = float(rng.choice([2.0, 6.0, 12.0, 24.0]))
     if rng.random() < 0.4:
@@ -203,13 +203,13 @@ def _draw_command(rng: np.random.Generator) -> Hidden:
 
 
 def _draw_own_law(rng: np.random.Generator) -> Hidden:
-    """A user's own law, over a link that may swing."""
+    """Draws a user's own law, over a link that may swing."""
     hidden = _draw_sinusoids(rng) if rng.random() < 0.3 else _draw_symmetric(rng)
     return hidden._replace(own_law=True, duration_s=20.0)
 
 
 def _draw_bursts(rng: np.random.Generator) -> Hidden:
-    """Losses in bursts, during which the last sample is used, or the reference stays where it is."""
+    """Draws losses in bursts, during which the last sample is used, or the reference stays where it is."""
     loss, burst = round(float(rng.uniform(0.05, 0.5)), 2), float(rng.integers(2, 40))
     hidden = _draw_loop(rng, lambda: _constant(rng)._replace(loss=loss, burst=burst))
     hold_s = None
@@ -235,9 +235,10 @@ PUSH = range(len(KINDS))
 
 
 def draw_hidden(seed: int) -> tuple[Hidden, float]:
-    """The loop of a seed, and its rate of growth, 1/s.
+    """Returns the loop of a seed, and its rate of growth, 1/s.
 
-    Its damping is a factor of that at its edge of stability, which is found by halving.
+    The damping is a factor of the damping at the edge of stability, which is found by
+    bisection.
     """
     rng = np.random.default_rng(seed)
     kind = list(KINDS)[seed % len(KINDS)]
@@ -255,7 +256,7 @@ def draw_hidden(seed: int) -> tuple[Hidden, float]:
 
 
 def _find_edge(hidden: Hidden) -> float:
-    """A factor on the damping at which the loop neither grows nor decays, to a hundredth."""
+    """Returns the factor on the damping at which the loop neither grows nor decays, to a hundredth."""
     low, high = BRACKET
     if measure_growth(hidden.scaled(low).loop, EDGE_SPAN_S) < 0.0:
         return low
@@ -269,7 +270,7 @@ def _find_edge(hidden: Hidden) -> float:
 
 
 def write_scenario(hidden: Hidden) -> Scenario:
-    """The scenario of a drawn loop."""
+    """Returns the scenario of a drawn loop."""
     loop, names = hidden.loop, "abc"[: len(hidden.arms)]
     sites, laws = {}, {}
     for n, name in enumerate(names):
@@ -284,7 +285,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
             "arm": hidden.arms[n],
             "control": {"law": "p_d", "K": stiffness, "d": damping},
         }
-    made: dict[str, Any] = {
+    keys: dict[str, Any] = {
         "rate_hz": loop.rate_hz,
         "duration_s": hidden.duration_s,
         "scheme": "second_order" if loop.second_order else "digital",
@@ -305,7 +306,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
         },
     }
     if hidden.earlier is not None:
-        made["timeline"] = [
+        keys["timeline"] = [
             {
                 "at_s": hidden.earlier[0],
                 "link": f"{names[j]}->{names[i]}",
@@ -314,12 +315,12 @@ def write_scenario(hidden: Hidden) -> Scenario:
             for (i, j), way in loop.ways.items()
         ]
     if loop.hold_s is not None:
-        made["on_stale"] = {
+        keys["on_stale"] = {
             "action": "hold",
             "age_ms": 1e3 * loop.hold_s,
             "return_s": loop.return_s,
         }
-    scenario = experiment("hidden", **made)
+    scenario = experiment("hidden", **keys)
     return load_scenario(scenario, laws) if hidden.own_law else scenario
 
 
@@ -328,7 +329,7 @@ def _begins_otherwise(hidden: Hidden) -> bool:
 
 
 def _write_way(way: Way) -> dict[str, Any]:
-    """The keys of a link."""
+    """Returns the keys of a link."""
     if way.points:
         table = ", ".join(
             f"{round(1e6 * t_s)} {round(1e3 * delay_ms)}" for t_s, delay_ms in way.points

@@ -55,7 +55,9 @@ class Way(NamedTuple):
 
     @property
     def table_s(self) -> float:
-        """Time after which a table starts again; its last point lasts as long as the one before."""
+        """Returns the time after which a table starts again; its last point lasts as long as
+        the one before.
+        """
         if not self.points:
             return 0.0
         return 2.0 * self.points[-1][0] - self.points[-2][0]
@@ -95,7 +97,7 @@ def planar_inertia(
     inertias_kg_m2: Sequence[float],
     q2_rad: float,
 ) -> Array:
-    """M of a planar arm of two links, from any textbook, kg m^2."""
+    """Returns M of a planar arm of two links, from any textbook, kg m^2."""
     (l1, _), (m1, m2), (c1, c2), (i1, i2) = lengths_m, masses_kg, centres_m, inertias_kg_m2
     cosine = np.cos(q2_rad)
     m22 = i2 + m2 * c2**2
@@ -111,7 +113,9 @@ def gravity_gradient(
     q_rad: Sequence[float],
     g_m_s2: float = 9.81,
 ) -> Array:
-    """Derivative of the gravity torques of such an arm, whose first angle is from the horizontal, N m/rad."""
+    """Returns the derivative of the gravity torques of such an arm, whose first angle is from
+    the horizontal, N m/rad.
+    """
     (l1, _), (m1, m2), (c1, c2), (q1, q2) = lengths_m, masses_kg, centres_m, q_rad
     outer = -m2 * c2 * g_m_s2 * np.sin(q1 + q2)
     inner = -(m1 * c1 + m2 * l1) * g_m_s2 * np.sin(q1)
@@ -119,7 +123,7 @@ def gravity_gradient(
 
 
 def _move_exactly(inertia: Array, gravity: Array, h_s: float) -> Array:
-    """Transition of (x, x') over a tick, and the effect of a held torque, shape (4, 6)."""
+    """Returns the transition of (x, x') over a tick, and the effect of a held torque, shape (4, 6)."""
     mobility = np.linalg.inv(inertia)
     rates = np.zeros((6, 6))
     rates[:2, 2:4] = np.eye(2)
@@ -130,7 +134,9 @@ def _move_exactly(inertia: Array, gravity: Array, h_s: float) -> Array:
 def list_newest(
     way: Way, ticks: int, rate_hz: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """The newest sample that is there at each tick, -1 if none; a sample is used a tick later at the earliest."""
+    """Returns the newest arrived sample at each tick, -1 without any; a sample is used a tick
+    after its arrival at the earliest.
+    """
     sent = np.arange(ticks)
     tick_us = US // rate_hz
     sent_us = sent * tick_us
@@ -138,8 +144,8 @@ def list_newest(
         times_us = np.array([round(US * t_s) for t_s, _ in way.points])
         table_us = np.array([round(1e3 * delay_ms) for _, delay_ms in way.points])
         loop_us = 2 * times_us[-1] - times_us[-2]
-        place = np.searchsorted(times_us, sent_us % loop_us, side="right") - 1
-        delay_us = table_us[np.maximum(place, 0)]
+        index = np.searchsorted(times_us, sent_us % loop_us, side="right") - 1
+        delay_us = table_us[np.maximum(index, 0)]
     else:
         turns = sent_us / (US * way.period_s)
         sine = np.sin(2.0 * np.pi * turns + way.phase_rad)
@@ -155,7 +161,7 @@ def list_newest(
 
 
 def _draw_losses(way: Way, ticks: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Losses one by one, or in bursts whose lengths are geometric."""
+    """Draws losses one by one, or in bursts of geometric length."""
     if not way.burst:
         return rng.random(ticks) < way.loss
     lost = np.zeros(ticks, dtype=bool)
@@ -169,7 +175,7 @@ def _draw_losses(way: Way, ticks: int, rng: np.random.Generator) -> NDArray[np.b
 
 
 def measure_growth(loop: Loop, span_s: float, seed: int = 0) -> float:
-    """The rate of the fastest growing, or slowest decaying, motion of a loop, 1/s."""
+    """Returns the rate of the fastest growing, or slowest decaying, motion of a loop, 1/s."""
     rng = np.random.default_rng(seed)
     window_s = max([WINDOW_S, *(way.table_s for way in loop.ways.values())])
     span_s = max(span_s, LEAST_WINDOWS * window_s)
@@ -214,7 +220,9 @@ def _simulate(
     returning: int,
     window: int,
 ) -> Array:
-    """Logarithm of the largest speed in each window; the state is made small or large again after each."""
+    """Returns the logarithm of the largest speed in each window; the state is rescaled after
+    each window.
+    """
     ticks, count, _ = newest.shape
     reach = 1
     for k in range(ticks):

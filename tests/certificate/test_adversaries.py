@@ -1,4 +1,4 @@
-"""Runs that try to fool the judgement: those made by hand, and any number that are drawn."""
+"""Adversarial runs for the judgement: runs made by hand, and any number of drawn ones."""
 
 from collections.abc import Iterable
 
@@ -39,17 +39,17 @@ def _named(row: Row) -> str:
 
 @pytest.mark.parametrize("row", ROWS, ids=_named)
 def test_a_row_has_its_word_and_its_reason(row: Row) -> None:
-    found = trilat_net.certify(trilat_net.simulate(row.make()))
-    assert found.stability in row.words
-    assert row.reason in " ".join([found.end.text, *found.reasons]).lower()
+    certificate = trilat_net.certify(trilat_net.simulate(row.make()))
+    assert certificate.stability in row.words
+    assert row.reason in " ".join([certificate.end.text, *certificate.reasons]).lower()
 
 
 @pytest.mark.parametrize(
     "row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_named
 )
 def test_a_mirror_is_stable_on_live_links_too(row: Row) -> None:
-    found = trilat_net.certify(trilat_net.simulate(under_noise(row.make())))
-    assert found.stability in ("stable", "settled")
+    certificate = trilat_net.certify(trilat_net.simulate(under_noise(row.make())))
+    assert certificate.stability in ("stable", "settled")
 
 
 def test_every_row_has_its_mirror() -> None:
@@ -58,20 +58,20 @@ def test_every_row_has_its_mirror() -> None:
 
 
 def _speed(scenario: Scenario, *at_s: float) -> list[float]:
-    """The largest |qd| of the second before each time."""
-    run, found = FusedRun(scenario), []
+    """Returns the largest |qd| of the second before each time."""
+    run, speeds = FusedRun(scenario), []
     for end_s in at_s:
         run.advance_to(end_s - 1.0)
         peaks = []
         for t_s in np.linspace(end_s - 1.0, end_s, 50):
             run.advance_to(float(t_s))
             peaks.append(np.abs(run.records[:, 2:4]).max())
-        found.append(max(peaks))
-    return found
+        speeds.append(max(peaks))
+    return speeds
 
 
-def test_the_condition_of_every_drawn_law_can_be_evaluated() -> None:
-    """Whatever the law, the space, the number of sites and the links."""
+def test_every_drawn_laws_condition_has_a_value() -> None:
+    """For any law, space, number of sites and links."""
     for seed in range(WIDE_FROM, WIDE_FROM + 120):
         assert describe_law_conditions(draw_experiment(seed).scenario) is not None
 
@@ -81,7 +81,7 @@ def _row(what: str) -> Scenario:
 
 
 @pytest.mark.long
-def test_the_truth_of_rows_that_die_out_later() -> None:
+def test_rows_that_decay_later_are_true() -> None:
     """Parametric resonance detunes itself after minutes, and so does the limit cycle; both grew before."""
     first, last = _speed(_row("the delay swings at 1.7 Hz"), 60.0, 120.0)
     assert last > 5.0 * first > 1.0
@@ -94,7 +94,7 @@ GROW = [row for row in ROWS if row.mark in ("F1", "F5", "F2") or "hammers" in ro
 
 @pytest.mark.long
 @pytest.mark.parametrize("row", GROW, ids=_named)
-def test_the_truth_of_rows_that_grow(row: Row) -> None:
+def test_rows_that_grow_are_true(row: Row) -> None:
     assert find_truth(Drawn("row", row.make())).unstable
 
 
@@ -123,15 +123,15 @@ OF_THE_CORE = {"adaptive", "adaptive_box", "adaptive_robust", "lee_spong", "p_d"
     ids=str,
 )
 @pytest.mark.push
-def test_random_runs_do_not_fool_it(seeds: range) -> None:
-    """What certify and a sweep say of runs of which a third are near an edge of stability."""
+def test_certificates_of_random_runs_are_right(seeds: range) -> None:
+    """The words of `certify` and of a sweep on runs of which a third are near an edge of stability."""
     judged = list(map(judge_experiment, seeds))
     for by in ("certified", "swept"):
         _hold_near_an_edge(tally(judged, by))
 
 
 @pytest.mark.push
-def test_random_runs_do_not_fool_a_sweep() -> None:
+def test_sweeps_of_random_runs_are_right() -> None:
     _hold_near_an_edge(tally([_sweep(seed, draw_experiment(seed)) for seed in SWEPT], "swept"))
 
 
@@ -147,26 +147,26 @@ def _hold_near_an_edge(found: Tally) -> None:
 
 
 @pytest.mark.long
-def test_whatever_is_drawn_does_not_fool_it() -> None:
+def test_certificates_of_widely_drawn_runs_are_right() -> None:
     """Of those near no edge; `truths.csv` has the rates at which pushes grow."""
     _hold(tally_clear(map(judge_experiment, range(WIDE_FROM, count_stored()))))
 
 
 @pytest.mark.push
-def test_whatever_is_drawn_does_not_fool_a_sweep() -> None:
-    """The same by the compiled run alone; chains and task space are layouts of their own to compile."""
+def test_sweeps_of_widely_drawn_runs_are_right() -> None:
+    """The same by the compiled run alone; chains and task space need layouts of their own."""
     drawn = [(seed, draw_experiment(seed)) for seed in WIDELY]
     known = [
-        (seed, one)
-        for seed, one in drawn
-        if one.kind in OF_THE_CORE and one.has.endswith("joints")
+        (seed, drawn_case)
+        for seed, drawn_case in drawn
+        if drawn_case.kind in OF_THE_CORE and drawn_case.has.endswith("joints")
     ]
     assert len(LOGGED) + len(SWEPT) + len(HIDDEN_PUSH) + len(known) == BLOCK
-    _hold(tally_clear([_sweep(seed, one) for seed, one in known], "swept"))
+    _hold(tally_clear([_sweep(seed, drawn_case) for seed, drawn_case in known], "swept"))
 
 
 def _hold(found: Tally) -> None:
-    """No unstable run is called stable; few words are wrong otherwise, or missing."""
+    """Asserts that no unstable run is called stable, and that few words are wrong otherwise, or missing."""
     assert found.false_ok == 0
     assert found.false_alarm <= 0.01 * found.runs
     assert found.undecided <= max(1, OPEN_SHARE * found.runs)
@@ -175,14 +175,14 @@ def _hold(found: Tally) -> None:
 @pytest.mark.parametrize(
     "seed", [WIDE_FROM, *(pytest.param(n, marks=pytest.mark.long) for n in range(2001, 2040))]
 )
-def test_the_stored_truth_of_a_drawn_case_is_found_anew(seed: int) -> None:
+def test_stored_truths_are_reproducible(seed: int) -> None:
     drawn = draw_experiment(seed)
-    stored, found = read_truth(seed, drawn), find_truth(drawn)
-    assert (found.unstable, found.near) == (stored.unstable, stored.near)
+    stored, truth = read_truth(seed, drawn), find_truth(drawn)
+    assert (truth.unstable, truth.near) == (stored.unstable, stored.near)
 
 
 def test_a_run_without_motion_is_read_whole() -> None:
-    """It is packed a thousandfold, which the file of somebody else may not be."""
+    """The log is compressed a thousandfold, which would be refused in a stranger's file."""
     sites = {
         name: {"role": "slave" if name == "c" else "master", "q0_rad": [0.1, 0.2]}
         for name in "abc"
@@ -213,15 +213,15 @@ def test_a_run_without_motion_is_read_whole() -> None:
         ),
     ],
 )
-def test_stored_truths_and_words_are_found_anew(seeds: Iterable[int]) -> None:
+def test_stored_truths_and_words_are_reproducible(seeds: Iterable[int]) -> None:
     for seed in seeds:
         drawn = draw_experiment(seed)
-        stored, found = read_truth(seed, drawn), find_truth(drawn)
-        assert (found.unstable, found.near) == (stored.unstable, stored.near), seed
-        if None in (found.root_per_s, stored.root_per_s):
-            assert found.root_per_s is stored.root_per_s, seed
+        stored, truth = read_truth(seed, drawn), find_truth(drawn)
+        assert (truth.unstable, truth.near) == (stored.unstable, stored.near), seed
+        if None in (truth.root_per_s, stored.root_per_s):
+            assert truth.root_per_s is stored.root_per_s, seed
         else:
-            assert found.root_per_s == pytest.approx(stored.root_per_s, rel=1e-3, abs=1e-5), (
+            assert truth.root_per_s == pytest.approx(stored.root_per_s, rel=1e-3, abs=1e-5), (
                 seed
             )
         assert say_of(trilat_net.simulate(drawn.scenario)) == say_of_run(drawn.scenario), seed
@@ -230,6 +230,6 @@ def test_stored_truths_and_words_are_found_anew(seeds: Iterable[int]) -> None:
 @pytest.mark.long
 @settings(max_examples=8)
 @given(st.integers(0, 2**32 - 1))
-def test_no_seed_makes_it_call_unstable_runs_stable(seed: int) -> None:
-    judged = judge_experiment(seed, stored=False)
-    assert not any(tally([judged], by).false_ok for by in ("certified", "swept"))
+def test_unstable_runs_are_never_called_stable(seed: int) -> None:
+    judged_experiment = judge_experiment(seed, stored=False)
+    assert not any(tally([judged_experiment], by).false_ok for by in ("certified", "swept"))

@@ -1,4 +1,4 @@
-"""Six commands say the same about a run, because one function decides for all of them."""
+"""Six commands agree about every run, because one function decides for all of them."""
 
 import csv
 import json
@@ -138,20 +138,30 @@ def judge(scenario: Scenario) -> list[Statement]:
     return statements
 
 
-def disagree(one: Statement, other: Statement) -> str:
+def disagree(statement: Statement, other: Statement) -> str:
     """Returns in which way two commands disagree about a run. Empty if they agree."""
-    both = f"{one}, {other}"
-    if one.word and other.word and (one.word, one.rests_on) != (other.word, other.rests_on):
+    both = f"{statement}, {other}"
+    if (
+        statement.word
+        and other.word
+        and (statement.word, statement.rests_on) != (other.word, other.rests_on)
+    ):
         return f"words: {both}"
-    if one.roots and other.roots and one.roots != other.roots:
+    if statement.roots and other.roots and statement.roots != other.roots:
         return f"verdicts on small motions: {both}"
-    if one.rate_per_s is not None and other.rate_per_s is not None:
-        tolerance_per_s = SAME_RATE * (1.0 + abs(one.rate_per_s))
-        if abs(one.rate_per_s - other.rate_per_s) > tolerance_per_s:
+    if statement.rate_per_s is not None and other.rate_per_s is not None:
+        tolerance_per_s = SAME_RATE * (1.0 + abs(statement.rate_per_s))
+        if abs(statement.rate_per_s - other.rate_per_s) > tolerance_per_s:
             return f"rates: {both}"
-    if one.pushes is not None and other.pushes is not None and one.pushes != other.pushes:
+    if (
+        statement.pushes is not None
+        and other.pushes is not None
+        and statement.pushes != other.pushes
+    ):
         return f"pushes: {both}"
-    if (one.says_stable and other.says_unstable) or (one.says_unstable and other.says_stable):
+    if (statement.says_stable and other.says_unstable) or (
+        statement.says_unstable and other.says_stable
+    ):
         return f"contradiction: {both}"
     return ""
 
@@ -247,14 +257,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.push
 def test_commands_themselves_agree(folder: Path) -> None:
-    """The commands print what the functions above say, as far as JSON and tables have it."""
+    """The commands print the statements of the functions above, as far as JSON and tables contain them."""
     with (folder / "sweep" / "results.csv").open(encoding="utf-8") as stream:
         cells = list(csv.DictReader(stream))
     compared = read_statement(folder, "compare", *(f"{d}.mcap" for d in DAMPING))
-    words = set()
+    said = set()
     for d, cell in zip(DAMPING, cells, strict=True):
         certified = read_statement(folder, "certify", f"{d}.mcap")
-        words.add(certified["stability"])
+        said.add(certified["stability"])
         assert (cell["stability"], cell["rests_on"]) == (
             certified["stability"],
             certified["rests_on"],
@@ -274,11 +284,11 @@ def test_commands_themselves_agree(folder: Path) -> None:
         pushed = read_statement(folder, "twin", f"{d}.mcap")["pushes"]
         without_text = [{key: row[key] for key in row if key != "text"} for row in pushed]
         assert without_text == certified["twins"]["pushes"]
-    assert words == {"not stable", "stable"}
+    assert said == {"not stable", "stable"}
 
 
 @pytest.mark.long
-def test_a_report_says_what_a_certificate_says(folder: Path) -> None:
+def test_a_report_agrees_with_its_certificate(folder: Path) -> None:
     name = f"{DAMPING[0]}.mcap"
     certified = read_statement(folder, "certify", name)
     verdict = read_statement(folder, "report", name)["verdict"]
@@ -287,8 +297,8 @@ def test_a_report_says_what_a_certificate_says(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_run_of_the_suite_says_what_a_certificate_says() -> None:
-    """The run may have been made longer, which its certificate follows."""
+def test_a_suite_run_agrees_with_its_certificate() -> None:
+    """The run may have been made longer, and its certificate follows that length."""
     plan = plan_bench(
         laws=["p_d"], study="round-trips", tasks=["free"], links=["rtt8"], seeds=1
     )

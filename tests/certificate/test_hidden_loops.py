@@ -1,4 +1,6 @@
-"""Loops that hide their growth: what is said of them, and that their truth is the program's own motion."""
+"""Loops that hide their growth: the judgement of these loops, and their truth against the
+program's own motion.
+"""
 
 import numpy as np
 import pytest
@@ -22,12 +24,12 @@ BLOCK = 100
     ids=str,
 )
 @pytest.mark.push
-def test_hidden_growth_does_not_fool_it(seeds: range) -> None:
-    """None that grows is called stable, at most one in a hundred that decays is condemned."""
-    found = tally(map(judge_hidden, seeds))
-    assert found.false_ok == 0
-    assert found.false_alarm <= max(1, 0.01 * found.runs)
-    assert found.unstable >= 0.3 * found.runs
+def test_hidden_growth_is_found(seeds: range) -> None:
+    """No growing loop is called stable, and at most one in a hundred decaying loops is condemned."""
+    counts = tally(map(judge_hidden, seeds))
+    assert counts.false_ok == 0
+    assert counts.false_alarm <= max(1, 0.01 * counts.runs)
+    assert counts.unstable >= 0.3 * counts.runs
 
 
 @pytest.mark.parametrize("seed", [5, 12])
@@ -39,11 +41,13 @@ def test_a_law_without_permission_proves_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [4, 10])
-def test_small_motions_grow_as_the_truth_says(seed: int) -> None:
-    """A run from next to the rest has the rate of `linear_truth`, which knows nothing of the program."""
+def test_small_motions_grow_at_the_true_rate(seed: int) -> None:
+    """A run from next to the rest has the rate of `linear_truth`, which uses no code of the program."""
     hidden, rate_per_s = draw_hidden(seed)
-    apart = 1e-7 * np.random.default_rng(1).standard_normal(hidden.starts_rad.shape)
-    near = hidden._replace(starts_rad=hidden.pose_rad + apart, duration_s=60.0, earlier=None)
+    offsets_rad = 1e-7 * np.random.default_rng(1).standard_normal(hidden.starts_rad.shape)
+    near = hidden._replace(
+        starts_rad=hidden.pose_rad + offsets_rad, duration_s=60.0, earlier=None
+    )
     log = trilat_net.simulate(write_scenario(near))
     speeds = np.abs(np.hstack([log[name].qd for name in log.sites])).max(axis=1)
     windows = np.log(speeds[: len(speeds) // 400 * 400].reshape(-1, 400).max(axis=1))

@@ -1,4 +1,4 @@
-"""A simulated run is recorded for its energies only where these may change the judgement."""
+"""A simulated run is recorded for its energies only if these may change the judgement."""
 
 from typing import Any
 
@@ -24,9 +24,9 @@ def count_recordings(
     scenario = load_scenario(name, settings)
     run = FusedRun(scenario)
     run.advance_to(scenario.duration_s)
-    judged = judge.judge_virtual_run(scenario, run)
+    judgement = judge.judge_virtual_run(scenario, run)
     monkeypatch.undo()
-    return len(recorded), str(judged.decision.stability)
+    return len(recorded), str(judgement.decision.stability)
 
 
 @pytest.mark.parametrize(

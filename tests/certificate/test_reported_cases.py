@@ -21,8 +21,8 @@ from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.execution.fused import FusedRun
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.code_consent import allow_own_code
 
 from ..virtual_runs import simulate_with_commands
 from .sampled_loops import SampledLoop, burst, constant, sine
@@ -73,24 +73,24 @@ def certify_case(case: Case) -> Certificate:
     return tn.certify(tn.simulate(case.loop.write_scenario(case.duration_s, case.apart_rad)))
 
 
-def assert_roots_decide(found: Certificate, rate_per_s: float) -> None:
+def assert_roots_decide(certificate: Certificate, rate_per_s: float) -> None:
     """Asserts that a verdict rests on exact roots with a rate, and that it is right.
 
     Args:
         found: The certificate of a run.
         rate_per_s: True rate of the slowest motion, in 1/s.
     """
-    assert found.roots is not None
-    assert found.roots.exact
-    assert found.roots.rate_per_s == pytest.approx(rate_per_s, abs=5e-5)
+    assert certificate.roots is not None
+    assert certificate.roots.exact
+    assert certificate.roots.rate_per_s == pytest.approx(rate_per_s, abs=5e-5)
     if rate_per_s > 0.0:
-        assert found.stability is Stability.NOT_STABLE
-        assert found.decision.rests_on.startswith("exact roots, fastest growing +")
-        assert found.roots.text in found.reasons
+        assert certificate.stability is Stability.NOT_STABLE
+        assert certificate.decision.rests_on.startswith("exact roots, fastest growing +")
+        assert certificate.roots.text in certificate.reasons
     else:
-        assert found.stability is Stability.STABLE
-        assert "exact roots, slowest -" in found.decision.rests_on
-        assert found.reasons == ()
+        assert certificate.stability is Stability.STABLE
+        assert "exact roots, slowest -" in certificate.decision.rests_on
+        assert certificate.reasons == ()
 
 
 @pytest.mark.parametrize(
@@ -112,8 +112,8 @@ def test_linear_loop_moves_as_the_run_does(loop: SampledLoop) -> None:
     first = np.stack([log[name].q[0] for name in loop.names])
     for periods in (1, 2):
         expected = loop.compute_angles(first, periods)
-        found = np.stack([log[name].q[periods * ticks] for name in loop.names])
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        angles = np.stack([log[name].q[periods * ticks] for name in loop.names])
+        np.testing.assert_allclose(angles, expected, atol=1e-9)
 
 
 # Row 1: a joint that grows slowly beside one that decays fast from a larger distance.
@@ -183,19 +183,19 @@ def test_growing_joint_is_found_beside_a_decaying_one(name: str) -> None:
     loop, duration_s, rate_per_s = SLOW_JOINT[name]
     assert loop.compute_rates(1)[0] == pytest.approx(rate_per_s, abs=1e-4)
     log = tn.simulate(write_hidden_joint(loop, duration_s))
-    found = tn.certify(log, own_laws=True)
-    assert found.end.stability is Stability.SETTLED
-    assert_roots_decide(found, rate_per_s)
+    certificate = tn.certify(log, own_laws=True)
+    assert certificate.end.stability is Stability.SETTLED
+    assert_roots_decide(certificate, rate_per_s)
 
     # The pushes show the growth too, without the roots.
-    assert found.twins is not None
-    worst = found.twins.worst
+    assert certificate.twins is not None
+    worst = certificate.twins.worst
     assert worst is not None
     assert worst.joint in {f"{site} joint 1" for site in "cde"}
     assert worst.rate_per_s == pytest.approx(rate_per_s, rel=0.15)
-    by_pushes = replace(found, roots=None).decision
+    by_pushes = replace(certificate, roots=None).decision
     assert by_pushes.stability in (Stability.NOT_STABLE, Stability.OPEN)
-    assert found.twins.text in (by_pushes.rests_on, *by_pushes.reasons)
+    assert certificate.twins.text in (by_pushes.rests_on, *by_pushes.reasons)
 
     forbidden = tn.certify(log)
     assert forbidden.stability is Stability.OPEN
@@ -206,9 +206,11 @@ def test_two_decaying_joints_are_settled() -> None:
     loop, duration_s, _ = SLOW_JOINT["two pairs"]
     damped = loop._replace(d=[[8.0, 8.0]] * 2 + [[2.0, 2.944]] * 2)
     assert damped.compute_rates(1)[0] == pytest.approx(-0.1511, abs=1e-4)
-    found = tn.certify(tn.simulate(write_hidden_joint(damped, duration_s)), own_laws=True)
-    assert found.stability is Stability.SETTLED
-    assert found.decision.rests_on.startswith("10 pushes over 20 s, all of which died away")
+    certificate = tn.certify(tn.simulate(write_hidden_joint(damped, duration_s)), own_laws=True)
+    assert certificate.stability is Stability.SETTLED
+    assert certificate.decision.rests_on.startswith(
+        "10 pushes over 20 s, all of which died away"
+    )
 
 
 # Row 2: two sinusoidal delays whose common period is much longer than the run.
@@ -247,12 +249,14 @@ COMMON_PERIODS = [
 @pytest.mark.parametrize("case", COMMON_PERIODS)
 def test_two_sinusoids_are_judged_over_their_common_period(case: Case) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
-    found = certify_case(case)
-    assert_roots_decide(found, case.rate_per_s)
-    assert found.twins is not None
-    assert found.twins.hides_period
-    assert found.roots is not None
-    assert f"over the period of {found.twins.delay_period_s:.6g} s" in found.roots.text
+    certificate = certify_case(case)
+    assert_roots_decide(certificate, case.rate_per_s)
+    assert certificate.twins is not None
+    assert certificate.twins.hides_period
+    assert certificate.roots is not None
+    assert (
+        f"over the period of {certificate.twins.delay_period_s:.6g} s" in certificate.roots.text
+    )
 
 
 # Row 3: looped traces of delays, of which a run shows little more than one period.
@@ -276,8 +280,8 @@ ENDS_LATE = [
 @pytest.mark.parametrize("case", LOOPED_TRACES)
 def test_looped_trace_is_judged_over_its_period(case: Case) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
-    found = certify_case(case)
-    assert_roots_decide(found, case.rate_per_s)
+    certificate = certify_case(case)
+    assert_roots_decide(certificate, case.rate_per_s)
     scenario = case.loop.write_scenario(case.duration_s, case.apart_rad)
     for duration_s in (0.5 * case.duration_s, 3.0 * case.duration_s):
         verdict = tn.linear(scenario, {"duration_s": duration_s}, ports=False).verdict
@@ -285,7 +289,7 @@ def test_looped_trace_is_judged_over_its_period(case: Case) -> None:
 
 
 @pytest.mark.parametrize(("loop_case", "share"), [(0, 0.5), (1, 0.4), (3, 0.5)])
-def test_run_before_the_first_burst_is_judged_with_it(loop_case: int, share: float) -> None:
+def test_runs_before_their_first_burst_count_it(loop_case: int, share: float) -> None:
     """All delays of the run are equal; those of the period are not."""
     case = LOOPED_TRACES[loop_case]
     short = case._replace(duration_s=share * case.duration_s)
@@ -355,12 +359,12 @@ def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     log = simulate_with_commands(scenario, "b", *case.commands)
     assert len(log.changes("b")) == len(case.commands)
     assert list_effective_commands(log) == []
-    found = tn.certify(log)
-    assert_roots_decide(found, case.rate_per_s)
-    assert tn.certify(tn.simulate(scenario)).decision == found.decision
+    certificate = tn.certify(log)
+    assert_roots_decide(certificate, case.rate_per_s)
+    assert tn.certify(tn.simulate(scenario)).decision == certificate.decision
 
 
-def test_command_with_effect_decides_by_the_roots_after_it() -> None:
+def test_effective_commands_decide_by_later_roots() -> None:
     stable = SATURATED._replace(d=3.626)
     later = stable._replace(delays={(0, 1): constant(250.0), (1, 0): constant(300.0)})
     rate_per_s = later.compute_rates(1)[0]
@@ -420,9 +424,9 @@ def test_own_law_that_decays_is_settled_with_permission(number: int) -> None:
     forbidden = tn.certify(log)
     assert forbidden.stability is Stability.OPEN
     assert "the imported control laws may not run" in forbidden.reasons[0]
-    found = tn.certify(log, own_laws=True)
-    assert found.stability is Stability.SETTLED
-    assert "all of which died away; its roots are not exact" in found.decision.rests_on
+    certificate = tn.certify(log, own_laws=True)
+    assert certificate.stability is Stability.SETTLED
+    assert "all of which died away; its roots are not exact" in certificate.decision.rests_on
 
 
 # Row 6: beats and bursts in runs that decay.
@@ -453,9 +457,9 @@ DECAYING_BEATS = [
 @pytest.mark.parametrize("case", DECAYING_BEATS)
 def test_decaying_beat_is_stable_however_its_record_ends(case: Case) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
-    found = certify_case(case)
-    assert found.end.stability is Stability.NOT_STABLE
-    assert_roots_decide(found, case.rate_per_s)
+    certificate = certify_case(case)
+    assert certificate.end.stability is Stability.NOT_STABLE
+    assert_roots_decide(certificate, case.rate_per_s)
 
 
 def test_growing_beat_is_not_stable() -> None:
@@ -507,18 +511,18 @@ def lasts(scenario: Scenario) -> bool:
 def test_last_burst_of_loss_does_not_decide(seed: int) -> None:
     """The arms hold in a burst, and swing after it; the pushes grow at no more than one joint."""
     assert not lasts(write_lossy(LOSSY, LONGER * 30.0, seed))
-    found = tn.certify(tn.simulate(write_lossy(LOSSY, 30.0, seed)))
-    assert found.end.stability is Stability.NOT_STABLE
-    assert found.stability is Stability.OPEN
-    assert "has 5 bursts of lost samples, too few" in found.reasons[0]
+    certificate = tn.certify(tn.simulate(write_lossy(LOSSY, 30.0, seed)))
+    assert certificate.end.stability is Stability.NOT_STABLE
+    assert certificate.stability is Stability.OPEN
+    assert "has 5 bursts of lost samples, too few" in certificate.reasons[0]
 
 
 def test_growth_over_bursts_of_loss_is_not_stable() -> None:
     loop = LOSSY._replace(d=0.6)
     assert lasts(write_lossy(loop, LONGER * 30.0, 1))
-    found = tn.certify(tn.simulate(write_lossy(loop, 30.0, 1)))
-    assert found.stability is Stability.NOT_STABLE
-    assert found.decision.rests_on.startswith("twins: ")
+    certificate = tn.certify(tn.simulate(write_lossy(loop, 30.0, 1)))
+    assert certificate.stability is Stability.NOT_STABLE
+    assert certificate.decision.rests_on.startswith("twins: ")
 
 
 # Row 7: motions that decay so slowly that the run shows no decay.
@@ -536,9 +540,9 @@ SLOW_GROWTH = [
 
 
 @pytest.mark.parametrize("case", [*SLOW_MOTIONS, *SLOW_GROWTH])
-def test_motion_near_the_edge_is_judged_by_its_roots(case: Case) -> None:
+def test_roots_judge_motion_near_the_edge(case: Case) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
-    found = certify_case(case)
-    assert found.end.stability is Stability.NOT_STABLE
-    assert "bounded oscillation" in found.end.text
-    assert_roots_decide(found, case.rate_per_s)
+    certificate = certify_case(case)
+    assert certificate.end.stability is Stability.NOT_STABLE
+    assert "bounded oscillation" in certificate.end.text
+    assert_roots_decide(certificate, case.rate_per_s)

@@ -74,11 +74,11 @@ def test_negative_energy_leaves_a_run_open_that_decays(
 ) -> None:
     log = tn.simulate(write_tdpa(delay_ms, K, B, 0.0))
     assert find_least_known_j(log) < -1e-6
-    found = tn.certify(log)
-    assert found.observed is not None
-    assert found.observed.finding is ObservedFinding.NEGATIVE
-    assert found.stability is Stability.OPEN
-    assert found.observed.text in found.reasons
+    certificate = tn.certify(log)
+    assert certificate.observed is not None
+    assert certificate.observed.finding is ObservedFinding.NEGATIVE
+    assert certificate.stability is Stability.OPEN
+    assert certificate.observed.text in certificate.reasons
     assert NEGATIVE_ENERGY_MEANING.startswith("an observed energy below zero")
 
 
@@ -86,11 +86,11 @@ def test_negative_energy_leaves_a_run_open_that_decays(
 def test_energy_within_the_reserve_proves_no_decay(delay_ms: float, K: float, B: float) -> None:
     log = tn.simulate(write_tdpa(delay_ms, K, B, None))
     assert find_least_known_j(log) >= 0.0
-    found = tn.certify(log)
-    assert found.observed is not None
-    assert found.observed.finding is ObservedFinding.PASSIVE
-    assert found.stability in (Stability.SETTLED, Stability.OPEN)
-    assert found.decision.rests_on == "" or "pushes" in found.decision.rests_on
+    certificate = tn.certify(log)
+    assert certificate.observed is not None
+    assert certificate.observed.finding is ObservedFinding.PASSIVE
+    assert certificate.stability in (Stability.SETTLED, Stability.OPEN)
+    assert certificate.decision.rests_on == "" or "pushes" in certificate.decision.rests_on
 
 
 # Row 12: what the conditions of laws prove.
@@ -101,9 +101,9 @@ def test_passive_laws_prove_bounded_motion_and_no_decay(law: str) -> None:
     for delay_ms in (20.0, 300.0):
         link = {"model": "constant", "delay_ms": delay_ms}
         scenario = unit_scenario({"m": {}, "s": {}}, {"law": law}, link=link, duration_s=5.0)
-        told = describe_law_conditions(scenario)
-        assert told
-        for line in told:
+        conditions = describe_law_conditions(scenario)
+        assert conditions
+        for line in conditions:
             assert "holds: motion stays bounded (decay is not proved)" in line
         assert list_law_proofs(scenario) == []
 
@@ -128,15 +128,15 @@ def write_sliding(loop: SampledLoop, duration_s: float) -> Scenario:
 )
 def test_theorem_covers_prismatic_joints(loop: SampledLoop) -> None:
     """M, C and G of sliding joints are constant, so that every step of the proof holds."""
-    found = tn.certify(tn.simulate(write_sliding(loop, 20.0)))
-    assert found.stability is Stability.STABLE
-    assert "the theorem, all of whose premises hold" in found.decision.rests_on
+    certificate = tn.certify(tn.simulate(write_sliding(loop, 20.0)))
+    assert certificate.stability is Stability.STABLE
+    assert "the theorem, all of whose premises hold" in certificate.decision.rests_on
 
 
-def test_theorem_does_not_cover_prismatic_joints_over_a_delay_that_varies() -> None:
+def test_theorem_excludes_prismatic_joints_over_varying_delay() -> None:
     swinging = SLIDING[0]._replace(delays=sine(80.0, 60.0, 1.5))
-    found = tn.certify(tn.simulate(write_sliding(swinging, 20.0)))
-    assert "the theorem" not in found.decision.rests_on
+    certificate = tn.certify(tn.simulate(write_sliding(swinging, 20.0)))
+    assert "the theorem" not in certificate.decision.rests_on
 
 
 # Row 14: a push at 0 s is not another start.
@@ -179,7 +179,7 @@ def measure_start(loop: SampledLoop, ticks: int) -> Any:
 
 
 @pytest.mark.parametrize("loop", PUSHED_LOOPS)
-def test_push_at_zero_keeps_the_history_of_the_run(loop: SampledLoop) -> None:
+def test_push_at_zero_keeps_the_runs_history(loop: SampledLoop) -> None:
     """The peers of a twin see the old pose for one delay, those of another start never do."""
     still = np.zeros((len(loop.names), len(loop.inertia)))
     pushed = still.copy()
@@ -192,7 +192,7 @@ def test_push_at_zero_keeps_the_history_of_the_run(loop: SampledLoop) -> None:
     np.testing.assert_allclose(measure_start(loop, last), start, rtol=1e-3, atol=1e-11)
 
 
-def test_push_at_zero_is_nearly_another_start_without_a_delay() -> None:
+def test_push_without_delay_nearly_equals_another_start() -> None:
     """The peers see the old pose for one tick only."""
     loop = SampledLoop(PAIR, constant(0.0), 10.0, 2.6, (), 1000)
     twin = measure_twin(loop, 0.5)

@@ -1,4 +1,4 @@
-"""`trilat`, run in this process through its own `main`, and what its errors must look like."""
+"""`trilat`, run in this process through its own `main`, and the required form of its errors."""
 
 import contextlib
 import io
@@ -15,8 +15,8 @@ from typer.main import get_command
 
 from trilat_net.app.cli import app, main
 from trilat_net.core.step.jit import compiling_notice
+from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.presentation import terminal_output
-from trilat_net.scenario.imported_code import allowed_code
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
 """The same as a process of its own."""
@@ -25,7 +25,7 @@ PLAIN = {**os.environ, "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "100"}
 
 
 class Done:
-    """How a command ended, and what it printed."""
+    """The exit code of a command, and its output."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
@@ -34,13 +34,13 @@ class Done:
         return f"exit code {self.code}\n--- out\n{self.out}\n--- err\n{self.err}"
 
     def succeeds(self) -> str:
-        """It ended well and complained of nothing; returns what it printed."""
+        """Asserts that the command ended well without complaint; returns its output."""
         assert self.code == 0, self
         assert self.err == "", self
         return self.out
 
     def refuses(self, *facts: str, code: int = 2) -> None:
-        """It said in one line what is wrong, with these facts, and no more."""
+        """Asserts that the command refused in one line that contains these facts, and printed no more."""
         assert self.code == code, self
         lines = self.err.splitlines()
         assert len(lines) == 1, self
@@ -51,13 +51,15 @@ class Done:
 
 @cache
 def whole_command() -> Any:
-    """`trilat` with all of its commands; to make it takes a while."""
+    """Returns `trilat` with all of its commands, built once because that takes a while."""
     return get_command(app)
 
 
-def parses(words: list[str]) -> None:
-    """A command line, `trilat` included, has a command, and no option or argument that this does not take."""
-    program, *rest = words
+def parses(arguments: list[str]) -> None:
+    """Asserts that a command line, `trilat` included, names a command, and only options and
+    arguments of that command.
+    """
+    program, *rest = arguments
     assert program == "trilat"
     command: Any = whole_command()
     while hasattr(command, "commands"):

@@ -1,4 +1,4 @@
-"""Bad input is one line on stderr and exit code 2: what is wrong, where, and what would be right."""
+"""Bad input gives one line on stderr and exit code 2: the error, its place, and the valid choice."""
 
 import contextlib
 import errno
@@ -32,7 +32,7 @@ OVERRIDES = {
 
 
 @pytest.mark.parametrize("override", OVERRIDES)
-def test_an_override_that_cannot_be_right_is_named(override: str, tmp_path: Path) -> None:
+def test_an_invalid_override_is_named(override: str, tmp_path: Path) -> None:
     done = trilat("scenario", "check", "paper", "--set", override, cwd=tmp_path)
     done.refuses(*OVERRIDES[override])
 
@@ -48,7 +48,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_a_file_that_is_no_scenario_is_named(kind: str, tmp_path: Path) -> None:
+def test_an_invalid_scenario_file_is_named(kind: str, tmp_path: Path) -> None:
     content, facts = FILES[kind]
     (tmp_path / "bad.toml").write_bytes(content)
     trilat("scenario", "check", "bad.toml", cwd=tmp_path).refuses("bad.toml", *facts)
@@ -105,7 +105,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("kind", COMMANDS)
-def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> None:
+def test_bad_input_exits_2_with_one_line(kind: str, tmp_path: Path) -> None:
     arguments, facts = COMMANDS[kind]
     trilat(*arguments, cwd=tmp_path).refuses(*facts)
     assert list(tmp_path.iterdir()) == []  # and nothing is left behind
@@ -173,10 +173,10 @@ def write_arms(kind: str, folder: Path) -> list[str]:
 @pytest.mark.parametrize("kind", ARMS)
 @pytest.mark.parametrize("command", TAKERS)
 def test_bad_arms_are_named_by_every_command(command: str, kind: str, tmp_path: Path) -> None:
-    given = write_arms(kind, tmp_path)
+    settings = write_arms(kind, tmp_path)
     if command.startswith("site"):
-        given = ["--scenario", *given]
-    trilat(*command.split(), *given, cwd=tmp_path).refuses(*ARMS[kind][2])
+        settings = ["--scenario", *settings]
+    trilat(*command.split(), *settings, cwd=tmp_path).refuses(*ARMS[kind][2])
     assert {path.name for path in tmp_path.iterdir()} == {"arms.toml", "heavy.urdf"}
 
 
@@ -185,7 +185,7 @@ READERS += ["log export --to csv", "log view --save x.rrd"]
 
 
 @pytest.mark.parametrize("command", READERS)
-def test_what_is_no_log_is_named(command: str, tmp_path: Path) -> None:
+def test_an_invalid_log_is_named(command: str, tmp_path: Path) -> None:
     trilat(*command.split(), "none.mcap", cwd=tmp_path).refuses(
         "none.mcap: cannot be read: No such file"
     )
@@ -214,7 +214,7 @@ def test_usage_errors_exit_with_2_without_a_traceback(
     assert "Traceback" not in done.err
 
 
-def test_a_demo_keeps_what_is_in_its_folder(tmp_path: Path) -> None:
+def test_a_demo_keeps_files_in_its_folder(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("precious")
     trilat("demo", "two_sites", "--out", tmp_path, cwd=tmp_path).refuses(
         "is not empty", "--force"
@@ -237,7 +237,7 @@ def test_a_demo_keeps_what_is_in_its_folder(tmp_path: Path) -> None:
         "scenario check",
     ],
 )
-def test_a_pipe_is_no_file_and_is_not_waited_for(command: str, tmp_path: Path) -> None:
+def test_a_pipe_is_refused_without_waiting(command: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     (tmp_path / "k").touch()
     name = "pipe.toml" if command in ("sim", "scenario check") else "./pipe.toml"
@@ -246,11 +246,11 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(command: str, tmp_path: Path) -
     )
 
 
-def test_other_files_that_command_is_given_are_no_pipes_either(tmp_path: Path) -> None:
+def test_pipes_are_refused_for_other_files_too(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     trilat("ping", "--zenoh-config", "pipe", cwd=tmp_path).refuses("a pipe or a device")
-    for given in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
-        options = [word for one in given for word in ("--set", one)]
+    for settings in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
+        options = [word for setting in settings for word in ("--set", setting)]
         trilat("scenario", "check", "two_sites", *options, cwd=tmp_path).refuses(
             "a pipe or a device"
         )
@@ -270,21 +270,19 @@ TAKING = {
 }
 
 
-@pytest.mark.parametrize("words", TAKING.values(), ids=TAKING)
-def test_odd_words_are_refused_in_one_line_without_their_controls(
-    words: list[str], tmp_path: Path
+@pytest.mark.parametrize("arguments", TAKING.values(), ids=TAKING)
+def test_refusals_of_odd_words_hide_control_characters(
+    arguments: list[str], tmp_path: Path
 ) -> None:
     for odd in ODD:
-        done = trilat(*(word.replace("{}", odd) for word in words), cwd=tmp_path)
+        done = trilat(*(word.replace("{}", odd) for word in arguments), cwd=tmp_path)
         done.refuses()
         assert done.err[:-1].isprintable()
         assert len(done.err) < 4100
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "9" * 4000, "0x" + "f" * 5000])
-def test_an_unsendable_number_is_refused_before_anybody_is_asked(
-    number: str, tmp_path: Path
-) -> None:
+def test_unsendable_numbers_are_refused_before_sending(number: str, tmp_path: Path) -> None:
     order = ["link", "m1->s", "--to", f"deviation_ms={number}"]
     trilat("set", "--session", "x", *order, cwd=tmp_path).refuses("to.deviation_ms: must be a")
 
@@ -295,21 +293,21 @@ def test_a_session_has_a_short_name(tmp_path: Path) -> None:
     )
 
 
-def test_what_others_wrote_has_no_effect_on_a_terminal() -> None:
-    """Texts, cells, titles and JSON: letters alone, whatever a peer or a file put into them."""
-    said, attack = io.StringIO(), "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
-    console = TextConsole(file=said, force_terminal=True, width=200)
+def test_foreign_text_cannot_control_a_terminal() -> None:
+    """Texts, cells, titles and JSON contain letters alone, whatever a peer or a file put into them."""
+    stream, attack = io.StringIO(), "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
+    console = TextConsole(file=stream, force_terminal=True, width=200)
     table = Table(title=attack)
     table.add_column(attack)
     table.add_row(attack)
-    for one in (attack, table):
-        console.print(one)
-    with contextlib.redirect_stdout(said):
+    for hostile in (attack, table):
+        console.print(hostile)
+    with contextlib.redirect_stdout(stream):
         print_line(attack)
         print_json({"text": attack})
-    shown = re.sub(r"\x1b\[[\d;]*m", "", said.getvalue())  # the console's own colours
-    assert all(letter.isprintable() or letter == "\n" for letter in shown)
-    assert json.loads("{" + said.getvalue().rpartition("{")[2]) == {"text": attack}
+    plain_text = re.sub(r"\x1b\[[\d;]*m", "", stream.getvalue())  # the console's own colours
+    assert all(letter.isprintable() or letter == "\n" for letter in plain_text)
+    assert json.loads("{" + stream.getvalue().rpartition("{")[2]) == {"text": attack}
 
 
 @pytest.mark.parametrize("command", ["figure", pytest.param("report", marks=pytest.mark.long)])
@@ -321,8 +319,8 @@ def test_a_full_disk_has_one_exit_code(command: str, tmp_path: Path, short_log: 
         trilat(command, "run.mcap", *names, cwd=tmp_path).refuses("No space left", code=5)
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
-    words = ["sim", "paper", "--duration", "0.05", "-o", "nowhere/run.mcap"]
-    trilat(*words, cwd=tmp_path).refuses(
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    arguments = ["sim", "paper", "--duration", "0.05", "-o", "nowhere/run.mcap"]
+    trilat(*arguments, cwd=tmp_path).refuses(
         "nowhere/run.mcap: cannot be written", "; the folder nowhere does not exist"
     )

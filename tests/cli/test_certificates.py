@@ -29,9 +29,9 @@ d = { c = 1.0 }
 """
 
 
-def test_a_stable_run_ends_with_0(tmp_path: Path) -> None:
+def test_a_stable_run_exits_0(tmp_path: Path) -> None:
     file = simulated(tmp_path, "free", "rate_hz=100", seconds="30")
-    printed = trilat("certify", file, "--all", cwd=tmp_path).succeeds()
+    output = trilat("certify", file, "--all", cwd=tmp_path).succeeds()
     facts = json.loads(trilat("certify", "--json", file, cwd=tmp_path).succeeds())
     assert (facts["verdict"], facts["passed"]) == ("covered", True)
     assert (facts["stability"], facts["reasons"], facts["roots"]["verdict"]) == (
@@ -39,15 +39,15 @@ def test_a_stable_run_ends_with_0(tmp_path: Path) -> None:
         [],
         "stable",
     )
-    assert printed.startswith("ok   stable: converged")
-    assert "ok   covered by the theorem: V did not rise: 29.78 J at 0 s, " in printed
-    assert "ok   this rest: stable, -0.1" in printed
-    assert "constant on every link: 200 ms" in printed
-    assert "ok   energy balance: closes to " in printed
-    assert "dissipated: disagreement" in printed
+    assert output.startswith("ok   stable: converged")
+    assert "ok   covered by the theorem: V did not rise: 29.78 J at 0 s, " in output
+    assert "ok   this rest: stable, -0.1" in output
+    assert "constant on every link: 200 ms" in output
+    assert "ok   energy balance: closes to " in output
+    assert "dissipated: disagreement" in output
 
 
-def test_a_simulation_that_diverged_says_how_long_it_lasted(tmp_path: Path) -> None:
+def test_diverged_simulations_say_how_long_they_lasted(tmp_path: Path) -> None:
     limit = ("--set", "limits.qd_limit_rad_s=0.5", "--duration", "2")
     done = trilat("sim", "free", "--set", "rate_hz=200", *limit, "-o", "run.mcap", cwd=tmp_path)
     (lasted,) = re.findall(
@@ -57,7 +57,7 @@ def test_a_simulation_that_diverged_says_how_long_it_lasted(tmp_path: Path) -> N
     assert 0.0 < float(lasted) < 2.0
 
 
-def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
+def test_a_diverged_run_exits_1(tmp_path: Path) -> None:
     file = simulated(tmp_path, "free", "rate_hz=200", "limits.qd_limit_rad_s=0.5")
     done = trilat("certify", file, cwd=tmp_path)
     assert done.code == 1
@@ -66,7 +66,7 @@ def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
     assert done.out.count("reached") == 1
 
 
-def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
+def test_undecided_is_its_own_word_without_success(tmp_path: Path) -> None:
     done = trilat(
         "certify",
         simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d", seconds="0.5"),
@@ -80,14 +80,14 @@ def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
     assert " V " not in everything.succeeds()  # p_d has no functional V
 
 
-def test_two_closed_groups_are_named_for_people_and_programs(tmp_path: Path) -> None:
+def test_closed_groups_are_named_in_text_and_json(tmp_path: Path) -> None:
     (tmp_path / "pairs.toml").write_text(PAIRS)
     trilat("sim", "pairs.toml", "-o", "run.mcap", cwd=tmp_path)
-    told = trilat("certify", "run.mcap", cwd=tmp_path)
-    assert told.code == 1
+    ended = trilat("certify", "run.mcap", cwd=tmp_path)
+    assert ended.code == 1
     assert (
         "V cannot be judged: {a, b} and {c, d} follow nobody outside: beta is not unique"
-        in told.out
+        in ended.out
     )
     facts = json.loads(trilat("certify", "--json", "run.mcap", cwd=tmp_path).out)
     assert facts["closed_groups"] == [["a", "b"], ["c", "d"]]

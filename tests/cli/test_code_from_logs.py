@@ -1,4 +1,6 @@
-"""Code from a log: none is imported unless somebody names its file (docs/sessions/code-that-runs.md)."""
+"""Code from a log: no module is imported unless the user names its file
+(docs/sessions/code-that-runs.md).
+"""
 
 import hashlib
 import json
@@ -19,14 +21,14 @@ from tests.cli.running import COMMAND, PLAIN, shorten, trilat
 from tests.log_editing import edited, opened
 from trilat_net.app.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
-from trilat_net.presentation.figures.registry import list_drawable_figures
-from trilat_net.scenario.code_consent import list_imported_code
-from trilat_net.scenario.imported_code import (
+from trilat_net.own_code.code_consent import list_imported_code
+from trilat_net.own_code.imported_code import (
     CodeKey,
     allowed_code,
     import_class,
     remembered_settings,
 )
+from trilat_net.presentation.figures.registry import list_drawable_figures
 
 WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
 """A module that begins so tells that it was imported."""
@@ -103,8 +105,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert (folder / "witness").exists()  # it does tell
     before, now = (
-        hashlib.sha256(one.encode()).hexdigest()
-        for one in (LAW, FILES["not a law"]["mylaws.py"])
+        hashlib.sha256(source.encode()).hexdigest()
+        for source in (LAW, FILES["not a law"]["mylaws.py"])
     )
     log = (folder / "run.mcap").read_bytes()
     text = opened(log).scenario_text.replace(before, now)
@@ -114,8 +116,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The folder of a log, in which commands run; nothing is allowed, and nothing remembered."""
+def log_folder(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of a log in which commands run; no code is allowed or remembered."""
     shutil.copy(logs / "run.mcap", tmp_path)
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
@@ -127,17 +129,17 @@ def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     allowed_code.update(before)  # logs that other tests keep name laws
 
 
-def _marks(words: list[str], law: str) -> tuple[Any, ...]:
-    brief = words[0] in ("verify", "rerun") or "--own-laws" in words
+def _marks(arguments: list[str], law: str) -> tuple[Any, ...]:
+    brief = arguments[0] in ("verify", "rerun") or "--own-laws" in arguments
     return (
         ()
-        if brief and "--json" not in words and law == "beside the log"
+        if brief and "--json" not in arguments and law == "beside the log"
         else (pytest.mark.long,)
     )
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "law"),
+    ("arguments", "code", "law"),
     [
         pytest.param(
             *case,
@@ -147,21 +149,23 @@ def _marks(words: list[str], law: str) -> tuple[Any, ...]:
         for case in CASES
     ],
 )
-def test_no_command_imports_what_a_log_names(
-    words: list[str], code: int, law: str, logs: Path, place: Path
+def test_no_command_imports_modules_named_in_logs(
+    arguments: list[str], code: int, law: str, logs: Path, log_folder: Path
 ) -> None:
     for name, text in FILES[law].items():
-        (place / name).write_text(text)
+        (log_folder / name).write_text(text)
     if law == "not a law":
-        shutil.copy(logs / "not a law.mcap", place / "run.mcap")
-    command = [COMMAND[0], *words] if words[0] == "-c" else [*COMMAND, *words]
+        shutil.copy(logs / "not a law.mcap", log_folder / "run.mcap")
+    command = [COMMAND[0], *arguments] if arguments[0] == "-c" else [*COMMAND, *arguments]
     environment = {
         **PLAIN,
         "WITNESS": os.environ["WITNESS"],
         "XDG_CONFIG_HOME": os.environ["XDG_CONFIG_HOME"],
     }
-    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
-    assert not (place / "witness").exists()
+    done = subprocess.run(
+        command, cwd=log_folder, env=environment, capture_output=True, text=True
+    )
+    assert not (log_folder / "witness").exists()
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
 
@@ -176,23 +180,23 @@ def test_no_command_imports_what_a_log_names(
         ),
     ],
 )
-def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> None:
+def test_looking_for_a_module_runs_no_code(code: str, log_folder: Path) -> None:
     """Python's finder of distutils imports the setuptools that is nearest."""
     for name in ("setuptools/__init__.py", "distutils/__init__.py", "a/b/c.py"):
-        (place / name).parent.mkdir(parents=True)
-        (place / name).write_text(WITNESS)
-    log = (place / "run.mcap").read_bytes()
+        (log_folder / name).parent.mkdir(parents=True)
+        (log_folder / name).write_text(WITNESS)
+    log = (log_folder / "run.mcap").read_bytes()
     text = opened(log).scenario_text.replace("mylaws:Spring", code)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
-    (place / "run.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    (log_folder / "run.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
     done = subprocess.run(
-        [*COMMAND, "verify", "run.mcap"], cwd=place, capture_output=True, text=True
+        [*COMMAND, "verify", "run.mcap"], cwd=log_folder, capture_output=True, text=True
     )
-    assert (done.returncode, imports(place)) == (4, []), done.stderr
+    assert (done.returncode, imports(log_folder)) == (4, []), done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_verify_says_what_was_not_executed_and_how_to_permit_it(
+def test_verify_names_skipped_code_and_its_permission(
     tmp_path: Path,
 ) -> None:
     # The other tests need to be the first that import mylaws.
@@ -211,18 +215,18 @@ def test_verify_says_what_was_not_executed_and_how_to_permit_it(
     assert "150/150 records identical" in allowed.out
 
 
-def test_the_table_has_all_that_was_asked_for() -> None:
+def test_the_table_covers_every_requested_case() -> None:
     assert len(CASES) >= 26
     assert {law for _, _, law in CASES} == set(FILES)
 
 
-def list_commands(command: Any, *words: str) -> Iterator[str]:
-    """Every command of the program, by its words."""
+def list_commands(command: Any, *arguments: str) -> Iterator[str]:
+    """Returns every command of the program, by its words."""
     if not hasattr(command, "commands"):
-        yield " ".join(words)
+        yield " ".join(arguments)
         return
     for name, inner in command.commands.items():
-        yield from list_commands(inner, *words, name)
+        yield from list_commands(inner, *arguments, name)
 
 
 RUN_NONE = {
@@ -248,7 +252,9 @@ RUN_NONE = {
 
 @pytest.mark.push
 def test_the_page_lists_every_command() -> None:
-    """A row of `docs/sessions/code-that-runs.md` says of each command whose code it runs; the others run none."""
+    """A row of `docs/sessions/code-that-runs.md` says of each command whose code it runs;
+    commands without row run none.
+    """
     page = Path(__file__).parents[2] / "docs" / "sessions" / "code-that-runs.md"
     rows = [
         line
@@ -284,21 +290,23 @@ ONLY_NAMING_OWN: dict[str, list[str]] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [*RUNNING_OWN, *ONLY_NAMING_OWN])
-def test_command_runs_own_code_as_the_page_says(name: str, place: Path) -> None:
-    (place / "mylaws.py").write_text(LAW)
+def test_commands_run_own_code_as_documented(name: str, log_folder: Path) -> None:
+    (log_folder / "mylaws.py").write_text(LAW)
     setting = ("--set", "sites.s.control.law=mylaws:Spring", "--set", "duration_s=0.5")
-    shown = trilat("scenario", "show", "paper", *setting, cwd=place).succeeds()
-    (place / "own.toml").write_text(
-        shown.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4")
+    output = trilat("scenario", "show", "paper", *setting, cwd=log_folder).succeeds()
+    (log_folder / "own.toml").write_text(
+        output.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4")
     )
-    trilat("experiment", "new", "own-reaching.toml", cwd=place).succeeds()
-    shorten(place / "own-reaching.toml")
-    protocol = (place / "own-reaching.toml").read_text(encoding="utf-8")
-    (place / "own-reaching.toml").write_text(protocol.replace('"paper"', '"./own.toml"', 1))
+    trilat("experiment", "new", "own-reaching.toml", cwd=log_folder).succeeds()
+    shorten(log_folder / "own-reaching.toml")
+    protocol = (log_folder / "own-reaching.toml").read_text(encoding="utf-8")
+    (log_folder / "own-reaching.toml").write_text(
+        protocol.replace('"paper"', '"./own.toml"', 1)
+    )
     words = {**RUNNING_OWN, **ONLY_NAMING_OWN}[name]
-    done = subprocess.run([*COMMAND, *words], cwd=place, capture_output=True, text=True)
+    done = subprocess.run([*COMMAND, *words], cwd=log_folder, capture_output=True, text=True)
     assert "Traceback" not in done.stderr, done.stderr
-    assert bool(imports(place)) == (name in RUNNING_OWN), done
+    assert bool(imports(log_folder)) == (name in RUNNING_OWN), done
 
 
 def imports(place: Path) -> list[str]:
@@ -306,24 +314,24 @@ def imports(place: Path) -> list[str]:
     return witness.read_text().split(";")[:-1] if witness.exists() else []
 
 
-def test_the_named_file_runs_and_no_other_of_its_name(place: Path) -> None:
-    (place / "mylaws.py").write_text(FILES["foreign"]["mylaws.py"])
-    (place / "kept").mkdir()
-    file = place / "kept" / "spring-v1.py"
+def test_only_the_named_file_runs(log_folder: Path) -> None:
+    (log_folder / "mylaws.py").write_text(FILES["foreign"]["mylaws.py"])
+    (log_folder / "kept").mkdir()
+    file = log_folder / "kept" / "spring-v1.py"
     file.write_text(LAW)
     log = tn.open_log("run.mcap", law=file)
     assert tn.verify(log, virtual=True).passed
-    assert imports(place) == [str(file)]
+    assert imports(log_folder) == [str(file)]
     tn.verify("run.mcap")  # this process has it already
-    assert imports(place) == [str(file)]
+    assert imports(log_folder) == [str(file)]
     assert not list(file.parent.glob("__pycache__"))
 
 
-def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
+def test_caches_beside_a_law_never_run(log_folder: Path) -> None:
     import importlib.util
     import py_compile
 
-    file, other = place / "mylaws.py", place / "other.py"
+    file, other = log_folder / "mylaws.py", log_folder / "other.py"
     file.write_text(LAW)
     other.write_text("raise SystemExit('cached')")
     cached = importlib.util.cache_from_source(str(file))
@@ -359,38 +367,40 @@ def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
         (None, "mylaws.py", ScenarioError, "cannot be read"),
     ],
 )
-def test_a_file_that_differs_is_refused_before_it_runs(
-    text: str | None, name: str, error: type[Exception], fact: str, place: Path
+def test_a_different_file_is_refused_before_running(
+    text: str | None, name: str, error: type[Exception], fact: str, log_folder: Path
 ) -> None:
     if text is not None:
-        (place / name).write_text(text)
-    asked = fact.startswith(("defines", "is not a law: the", "is not valid Python"))
+        (log_folder / name).write_text(text)
+    is_asked = fact.startswith(("defines", "is not a law: the", "is not valid Python"))
     with pytest.raises(error, match=fact):
-        tn.open_log("run.mcap", law=name, other_version=asked)
-    done = trilat("verify", "run.mcap", "--law", name, *["--other-version"] * asked, cwd=place)
+        tn.open_log("run.mcap", law=name, other_version=is_asked)
+    done = trilat(
+        "verify", "run.mcap", "--law", name, *["--other-version"] * is_asked, cwd=log_folder
+    )
     done.refuses(fact)
-    assert not imports(place)
+    assert not imports(log_folder)
 
 
-def test_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> None:
-    file = place / "mylaws.py"
+def test_files_changed_after_permission_do_not_run(log_folder: Path) -> None:
+    file = log_folder / "mylaws.py"
     file.write_text(LAW)
     log = tn.open_log("run.mcap", law=file)
     file.write_text(f"{LAW}# a word\n")
     assert tn.verify(log).result.withheld == ["s"]
     with pytest.raises(ScenarioError, match="its hash is not the permitted one"):
         tn.rerun(log, ["s"])
-    assert not imports(place)
+    assert not imports(log_folder)
 
 
-def test_a_remembered_file_runs_for_its_hash_alone(place: Path) -> None:
-    file = place / "kept.py"
+def test_a_remembered_file_runs_for_its_hash(log_folder: Path) -> None:
+    file = log_folder / "kept.py"
     file.write_text(LAW)
-    trilat("verify", "run.mcap", "--remember", cwd=place).refuses("give --law FILE too")
-    assert trilat("verify", "run.mcap", "--law", file, "--remember", cwd=place).code == 0
-    assert trilat("verify", "run.mcap", cwd=place).code == 0
+    trilat("verify", "run.mcap", "--remember", cwd=log_folder).refuses("give --law FILE too")
+    assert trilat("verify", "run.mcap", "--law", file, "--remember", cwd=log_folder).code == 0
+    assert trilat("verify", "run.mcap", cwd=log_folder).code == 0
     file.write_text(f"{LAW}# a word\n")
-    assert trilat("verify", "run.mcap", cwd=place).code == 4
+    assert trilat("verify", "run.mcap", cwd=log_folder).code == 4
 
 
 READER = """import os
@@ -423,15 +433,17 @@ def save_log_of_reader(
 
 
 @pytest.fixture
-def reader(place: Path) -> Path:
-    """A law that reads a file, a log of its user, and logs of strangers with the same hash."""
-    (place / "mylaws.py").write_text(READER)
+def reader(log_folder: Path) -> Path:
+    """Writes a law that reads a file, a log of its user, and logs of strangers with the same hash."""
+    (log_folder / "mylaws.py").write_text(READER)
     for name in ("gains.csv", "secret.txt"):
-        (place / name).write_text("1")
-    save_log_of_reader(place, "own.mcap", {"K": 50.0})
-    save_log_of_reader(place, "stranger.mcap", {"K": 50.0, "table": str(place / "secret.txt")})
-    save_log_of_reader(place, "class.mcap", {"K": 50.0}, "Other")
-    return place
+        (log_folder / name).write_text("1")
+    save_log_of_reader(log_folder, "own.mcap", {"K": 50.0})
+    save_log_of_reader(
+        log_folder, "stranger.mcap", {"K": 50.0, "table": str(log_folder / "secret.txt")}
+    )
+    save_log_of_reader(log_folder, "class.mcap", {"K": 50.0}, "Other")
+    return log_folder
 
 
 def test_remembered_file_runs_with_remembered_settings_alone(reader: Path) -> None:
@@ -455,7 +467,7 @@ def test_remembered_file_runs_with_remembered_settings_alone(reader: Path) -> No
 
 
 def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
-    """A notebook in which somebody ran a law opens a stranger's log of the same law."""
+    """A notebook that has run a law opens a stranger's log of the same law."""
     tn.simulate(
         "two_sites", {"control.law": "mylaws:Spring", "control.K": 50.0}, duration_s=0.05
     )
@@ -474,7 +486,7 @@ def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
     assert not imports(reader)
 
 
-def test_figures_run_the_laws_that_a_user_permitted_and_no_others(reader: Path) -> None:
+def test_figures_run_only_permitted_laws(reader: Path) -> None:
     stranger = tn.open_log("stranger.mcap")
     tn.figure(stranger, "overview")
     assert "twins" not in list_drawable_figures(stranger)
@@ -490,7 +502,7 @@ def test_figures_run_the_laws_that_a_user_permitted_and_no_others(reader: Path) 
 
 
 @pytest.mark.usefixtures("reader")
-def test_settings_that_a_person_changes_may_run() -> None:
+def test_settings_changed_by_a_person_may_run() -> None:
     log = tn.open_log("own.mcap", law="mylaws.py")
     again = tn.rerun(log, ["s"], {"sites.s.control.K": 60.0})
     assert again.sites["s"].executed == 50
@@ -523,7 +535,7 @@ def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
     ],
     ids=["plant", "hand", "law"],
 )
-@pytest.mark.usefixtures("place")
+@pytest.mark.usefixtures("log_folder")
 def test_code_with_other_settings_is_withheld(keys: dict[str, Any]) -> None:
     allowed = tn.load_scenario("paper", keys)
     (named,) = list_imported_code([allowed])
@@ -533,8 +545,8 @@ def test_code_with_other_settings_is_withheld(keys: dict[str, Any]) -> None:
         import_class(CodeKey.of(other), "sites.s", named.method)
 
 
-def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
-    (place / "ownlaw.py").write_text(LAW)
+def test_laws_of_this_process_need_no_permission(log_folder: Path) -> None:
+    (log_folder / "ownlaw.py").write_text(LAW)
     log = tn.simulate("two_sites", {"control.law": "ownlaw:Spring"}, duration_s=0.05)
     log.save("own.mcap")
     assert tn.verify("own.mcap").passed
@@ -549,10 +561,10 @@ def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
-    folder = place / "laws"
+def test_a_compiled_law_runs_from_the_named_file(log_folder: Path) -> None:
+    folder = log_folder / "laws"
     folder.mkdir()
-    (place / "gains.py").write_text(WITNESS)  # of the working directory
+    (log_folder / "gains.py").write_text(WITNESS)  # of the working directory
     (folder / "gains.py").write_text("K = 60.0\n")
     (folder / "quick.py").write_text(
         "import dataclasses\nimport trilat_net\nfrom gains import K\n"
@@ -562,7 +574,7 @@ def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
         "    def torque(self, now):\n        for i in range(now.joints):\n"
         "            now.tau[i] = now.gravity[i] - self.K * (now.q[i] - now.q_des[i])\n"
     )
-    made = trilat(
+    ended = trilat(
         "sim",
         "two_sites",
         "--duration",
@@ -571,13 +583,13 @@ def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
         "control.law=quick:Spring",
         cwd=folder,
     )
-    assert made.code == 0
+    assert ended.code == 0
     allowed_code.clear()
-    shown = subprocess.run(
+    process = subprocess.run(
         [*COMMAND, "verify", "laws/two_sites.mcap", "--law", "laws/quick.py"],
-        cwd=place,
+        cwd=log_folder,
         capture_output=True,
         text=True,
     )
-    assert "100/100 records identical" in shown.stdout, shown.stderr
-    assert not imports(place)
+    assert "100/100 records identical" in process.stdout, process.stderr
+    assert not imports(log_folder)

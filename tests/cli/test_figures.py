@@ -32,7 +32,7 @@ def test_figures_are_written_by_name(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
+def test_the_default_is_pdf_and_png(folder: Path) -> None:
     done = trilat("figure", "run.mcap", "control_torques", "--width", "7", "--json", cwd=folder)
     paths = json.loads(done.succeeds())
     assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
@@ -42,10 +42,10 @@ def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
     )
 
 
-def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
-    printed = trilat("figure", "run.mcap", "--list", cwd=folder).succeeds()
-    assert "settling times" in printed
-    assert "no site has a wall" in printed
+def test_the_list_names_impossible_figures(folder: Path) -> None:
+    output = trilat("figure", "run.mcap", "--list", cwd=folder).succeeds()
+    assert "settling times" in output
+    assert "no site has a wall" in output
     rows = json.loads(trilat("figure", "run.mcap", "--list", "--json", cwd=folder).succeeds())
     absent = {row["name"]: row["absent"] for row in rows}
     assert absent["positions"] is None
@@ -54,14 +54,14 @@ def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "facts"),
+    ("arguments", "facts"),
     [
         (["contact"], ["no site has a wall"]),
         (["phase", "--format", ","], ["--format is empty"]),
         (["phase", "--out", "run.mcap"], ["run.mcap"]),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(
-    folder: Path, words: list[str], facts: list[str]
+def test_impossible_figures_are_refused(
+    folder: Path, arguments: list[str], facts: list[str]
 ) -> None:
-    trilat("figure", "run.mcap", *words, cwd=folder).refuses(*facts)
+    trilat("figure", "run.mcap", *arguments, cwd=folder).refuses(*facts)

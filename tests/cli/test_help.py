@@ -36,7 +36,7 @@ COMMANDS = [
 
 
 @cache
-def printed(*arguments: str) -> str:
+def print_help(*arguments: str) -> str:
     result = CliRunner().invoke(
         app, list(arguments), env={"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "200"}
     )
@@ -45,11 +45,11 @@ def printed(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_every_command_has_help_with_example_and_explains_its_options(
+def test_commands_have_help_examples_and_explained_options(
     command: list[str],
 ) -> None:
-    text = printed(*command, "-h")
-    assert text == printed(*command, "--help")
+    text = print_help(*command, "-h")
+    assert text == print_help(*command, "--help")
     assert re.search(f"Example: trilat {'.* '.join(command)}", text)
     for line in text.splitlines():
         option = re.match(r"[│| ]*(--[a-z-]+)", line)
@@ -67,13 +67,13 @@ def test_every_command_has_help_with_example_and_explains_its_options(
         assert "--set" in text
 
 
-def test_the_main_help_names_what_to_begin_with() -> None:
-    assert "trilat demo paper" in printed("--help")
+def test_the_main_help_names_first_steps() -> None:
+    assert "trilat demo paper" in print_help("--help")
 
 
 def test_the_main_help_has_six_panels() -> None:
     panels: dict[str, list[str]] = {}
-    for line in printed("--help").splitlines():
+    for line in print_help("--help").splitlines():
         if title := re.match(r"╭─ (.+?) ─+╮", line):
             panels[title[1]] = []
         elif command := re.match(r"│ ([a-z]\S*) ", line):
@@ -86,17 +86,17 @@ def test_the_main_help_has_six_panels() -> None:
 
 
 @pytest.mark.parametrize("name", sorted({name.split()[0] for name in NAMES}))
-def test_a_purpose_fits_on_one_line_of_the_main_help(name: str) -> None:
-    (line,) = re.findall(rf"^│ {name} +(.+?) +│$", printed("--help"), re.MULTILINE)
+def test_purposes_fit_one_line_of_main_help(name: str) -> None:
+    (line,) = re.findall(rf"^│ {name} +(.+?) +│$", print_help("--help"), re.MULTILINE)
     assert len(line) <= 64
     assert re.fullmatch(r"[A-Z].*[.?]", line)
     assert ". " not in line
 
 
 @pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
-def test_a_help_ends_with_an_example_and_a_page(command: str) -> None:
+def test_help_ends_with_an_example_and_page(command: str) -> None:
     *_, example, page = (
-        line for line in printed(*command.split(), "-h").splitlines() if line.strip()
+        line for line in print_help(*command.split(), "-h").splitlines() if line.strip()
     )
     assert example.split()[0] == "Example:"
     assert page.startswith(" Docs: ")
@@ -105,40 +105,40 @@ def test_a_help_ends_with_an_example_and_a_page(command: str) -> None:
 
 
 @pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
-def test_a_help_starts_with_one_sentence(command: str) -> None:
-    found: Any = typer.main.get_command(app)
+def test_help_starts_with_one_sentence(command: str) -> None:
+    command_found: Any = typer.main.get_command(app)
     for word in command.split():
-        found = found.commands[word]
-    purpose = found.help.split("\n\n")[0]
+        command_found = command_found.commands[word]
+    purpose = command_found.help.split("\n\n")[0]
     assert re.fullmatch(r"[A-Z][^\n]*[.?]", purpose)
     assert not re.search(r"[.?] [A-Z]", purpose)
 
 
-def test_help_lists_all_laws_that_can_be_tuned() -> None:
+def test_help_lists_all_tunable_laws() -> None:
     listed = {*list_laws(), "known"}
     assert listed == set(SEARCH_SPACES)
-    words = " ".join(re.sub("[│|]", " ", printed("compare", "--help")).split())
-    assert all(re.search(rf"\b{law}\b", words) for law in listed)
+    text = " ".join(re.sub("[│|]", " ", print_help("compare", "--help")).split())
+    assert all(re.search(rf"\b{law}\b", text) for law in listed)
 
 
-def test_only_commands_that_accept_folders_of_logs_offer_them(tmp_path: Path) -> None:
-    """The others name the logs in the folder."""
+def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:
+    """The other commands name the logs in the folder."""
     simulated(tmp_path, "paper", seconds="0.05")
     (tmp_path / "logs").mkdir()
     (tmp_path / "run.mcap").rename(tmp_path / "logs" / "one.mcap")
     for command in COMMANDS:
-        text = printed(*command, "--help")
+        text = print_help(*command, "--help")
         if "MCAP log" not in text or command[0] in ("record", "identify"):
             continue
         accepts = "folders with MCAP logs" in text
         assert accepts == (command == ["log", "export"])
-        words = ["--key", "x.key"] if command == ["log", "sign"] else []
+        key_options = ["--key", "x.key"] if command == ["log", "sign"] else []
         if accepts:
-            words = ["--to", "csv", "-o", "tables"]
+            key_options = ["--to", "csv", "-o", "tables"]
         if command == ["log", "view"]:
-            words = ["--save", "view.rrd"]
+            key_options = ["--save", "view.rrd"]
         count = 2 if command == ["compare"] else 1
-        done = trilat(*command, *["logs"] * count, *words, cwd=tmp_path)
+        done = trilat(*command, *["logs"] * count, *key_options, cwd=tmp_path)
         assert (done.code == 0) == accepts, done
         if not accepts and command != ["log", "sign"]:
             assert "is a folder, not a file" in done.err, (command, done)
@@ -146,7 +146,7 @@ def test_only_commands_that_accept_folders_of_logs_offer_them(tmp_path: Path) ->
 
 
 def test_export_help_names_every_format_and_setting() -> None:
-    text = " ".join(printed("log", "export", "--help").replace("│", " ").split())
+    text = " ".join(print_help("log", "export", "--help").replace("│", " ").split())
     for form in list_export_formats():
         module = import_module(f"trilat_net.presentation.exports.{form}")
         assert form in text

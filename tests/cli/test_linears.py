@@ -11,8 +11,8 @@ from .running import trilat
 AT = ("--pose", "0.07,0.23")
 
 
-def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
-    printed = trilat(
+def test_output_has_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
+    output = trilat(
         "linear", "p_d_margin", "--set", "control.d=0.9", *AT, cwd=tmp_path
     ).succeeds()
     for text in (
@@ -22,35 +22,35 @@ def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
         "q1 of m1, m2, s",
         "unstable:",
     ):
-        assert text in printed
-    assert "stable for common delays up to" in printed
-    assert "2 roots are zero by structure" in printed
+        assert text in output
+    assert "stable for common delays up to" in output
+    assert "2 roots are zero by structure" in output
 
 
 @pytest.mark.long
-def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
+def test_output_says_where_stability_changes_over_keys(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.1:3", "--over", "link.delay_ms=1:50")
-    printed = trilat(
+    output = trilat(
         "linear", "p_d_margin", "--no-ports", "--pose=-0.1,0.3", *over, cwd=tmp_path
     ).succeeds()
-    assert "all sites at (-0.1000, 0.3000) rad" in printed
-    assert "control.d from 0.1 to 3: stable from 0.96" in printed
-    assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in printed
+    assert "all sites at (-0.1000, 0.3000) rad" in output
+    assert "control.d from 0.1 to 3: stable from 0.96" in output
+    assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in output
 
 
 @pytest.mark.long
-def test_json_has_all(tmp_path: Path) -> None:
+def test_json_has_all_results(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.5:2")
-    told = json.loads(
+    facts = json.loads(
         trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds()
     )
-    assert told["verdict"] == "stable"
-    assert len(told["continuous"]["roots"]) == 6
-    (edge,) = told["edges"]["control.d"]
+    assert facts["verdict"] == "stable"
+    assert len(facts["continuous"]["roots"]) == 6
+    (edge,) = facts["edges"]["control.d"]
     assert edge["stable_above"] is True
 
 
-def test_a_figure_is_the_same_file_every_time(tmp_path: Path) -> None:
+def test_figures_are_reproducible_files(tmp_path: Path) -> None:
     for name in ("one.svg", "two.svg"):
         trilat(
             "linear", "p_d_margin", "--no-ports", *AT, "--figure", name, cwd=tmp_path
@@ -77,13 +77,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> None:
+def test_bad_input_exits_2_with_one_line(kind: str, tmp_path: Path) -> None:
     arguments, facts = REFUSED[kind]
     trilat("linear", *arguments, cwd=tmp_path).refuses(*facts)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
+def test_an_existing_figure_is_kept(tmp_path: Path) -> None:
     (tmp_path / "map.png").write_text("precious")
     trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses(
         "map.png", "exists", "--force"
@@ -91,8 +91,8 @@ def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
     assert (tmp_path / "map.png").read_text() == "precious"
 
 
-def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
-    """As docs/studies/measured-hands.md has it, with the sines of its page."""
+def test_an_identified_hand_holds_the_ports(tmp_path: Path) -> None:
+    """As documented in docs/studies/measured-hands.md, with the sines of that page."""
     (sines,) = (
         block.text
         for block in find_blocks("docs/studies/measured-hands.md")
@@ -103,7 +103,7 @@ def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
     )
     (tmp_path / "moved.toml").write_text(f"{shipped}\n{sines}", encoding="utf-8")
     spring = 'sites.m.hands=[{kind="tip_spring",stiffness_n_m=[50,50],damping_n_s_m=[4,4]}]'
-    told = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250")
+    settings = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250")
     # the sines move s at 11.5 rad/s
     fast = (
         "--set",
@@ -111,11 +111,11 @@ def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
         "-o",
         "run.mcap",
     )
-    trilat("sim", "moved.toml", "--duration", "30", *told, *fast, cwd=tmp_path).succeeds()
-    asked = ("identify", "hand", "run.mcap", "--site", "m")
-    assert "coherence" in trilat(*asked, cwd=tmp_path).succeeds()
+    trilat("sim", "moved.toml", "--duration", "30", *settings, *fast, cwd=tmp_path).succeeds()
+    arguments = ("identify", "hand", "run.mcap", "--site", "m")
+    assert "coherence" in trilat(*arguments, cwd=tmp_path).succeeds()
     (tmp_path / "m.json").write_text(
-        trilat(*asked, "--json", cwd=tmp_path).succeeds(), encoding="utf-8"
+        trilat(*arguments, "--json", cwd=tmp_path).succeeds(), encoding="utf-8"
     )
     held = ("linear", "p_d_margin_two", *AT, "--set", "control.d=1.96", "--operators", "m.json")
     line = "the measured operators at the masters, any at each: not shown at 0.001-"

@@ -1,4 +1,4 @@
-"""`trilat log export`: one sentence on success, one where it fails, and nothing half made."""
+"""`trilat log export`: one sentence on success, one on failure, and no incomplete files."""
 
 import resource
 import sys
@@ -38,7 +38,7 @@ def test_a_log_is_exported_beside_itself(form: str, folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == sorted(["run.mcap", FORMS[form]])
 
 
-def test_an_export_replaces_only_what_it_may(folder: Path) -> None:
+def test_exports_replace_only_their_own_kind(folder: Path) -> None:
     command = ("log", "export", "run.mcap", "--to", "csv", "-o", "tables")
     trilat(*command, cwd=folder).succeeds()
     trilat(*command, cwd=folder).refuses("tables: already exists", "--force")
@@ -49,7 +49,7 @@ def test_an_export_replaces_only_what_it_may(folder: Path) -> None:
     assert (folder / "run.mcap").read_bytes() == recorded("paper")
 
 
-def test_the_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
+def test_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
     count = len(messages(recorded("paper")))
     for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
         (folder / f"run-00{n + 1}.mcap").write_bytes(data)
@@ -58,8 +58,8 @@ def test_the_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
     assert np.load(folder / "out.npz")["m1/tick"].tolist() == list(range(120))
 
 
-def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
-    """The parts of one of them are one episode: 0.12 s at 1 kHz are four frames of 30 Hz, or six of 50 Hz."""
+def test_a_folder_of_logs_becomes_episodes(folder: Path) -> None:
+    """The parts of one log are one episode: 0.12 s at 1 kHz are four frames of 30 Hz, or six of 50 Hz."""
     count = len(messages(recorded("paper")))
     (folder / "logs").mkdir()
     for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
@@ -87,7 +87,7 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
     )
 
 
-def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:
+def test_impossible_exports_are_refused_before_reading(folder: Path) -> None:
     done = trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder)
     done.refuses("--to", "xlsx", "csv, lerobot, mat, npz, parquet, ros2")
     assert [path.name for path in folder.iterdir()] == ["run.mcap"]
@@ -101,7 +101,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> No
         ("lerobot", "pyarrow.parquet", "lerobot"),
     ],
 )
-def test_package_that_is_missing_is_named_with_what_installs_it(
+def test_missing_packages_are_named_with_their_installation(
     form: str, module: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
@@ -119,11 +119,11 @@ def test_csv_and_npz_need_no_extra(
     trilat("log", "export", "run.mcap", "--to", form, cwd=folder).succeeds()
 
 
-def test_a_record_that_cannot_be_read_leaves_nothing_behind(folder: Path) -> None:
-    every = messages(recorded("paper"))
-    topic = next(m[0] for m in every if m[0].endswith("/s/state"))
+def test_an_unreadable_record_leaves_no_files(folder: Path) -> None:
+    all_messages = messages(recorded("paper"))
+    topic = next(m[0] for m in all_messages if m[0].endswith("/s/state"))
     (folder / "bad.mcap").write_bytes(
-        a_file(recorded("paper"), [*every, (topic, b"\x80", 0, 0, 0)])
+        a_file(recorded("paper"), [*all_messages, (topic, b"\x80", 0, 0, 0)])
     )
     done = trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder)
     done.refuses("bad.mcap: a record of s cannot be")
@@ -132,7 +132,9 @@ def test_a_record_that_cannot_be_read_leaves_nothing_behind(folder: Path) -> Non
 
 @contextmanager
 def no_file_longer_than(size: int) -> Iterator[None]:
-    """As a full disk, for every library that writes; but Python would keep modules that are cut off there."""
+    """Emulates a full disk for every library that writes, but keeps Python from caching
+    truncated modules.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with mock.patch.object(sys, "dont_write_bytecode", True):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
@@ -143,7 +145,7 @@ def no_file_longer_than(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_full_disk_is_one_sentence_and_leaves_nothing(form: str, folder: Path) -> None:
+def test_a_full_disk_is_one_sentence_without_files(form: str, folder: Path) -> None:
     with no_file_longer_than(10_000):
         done = trilat("log", "export", "run.mcap", "--to", form, cwd=folder)
     done.refuses("cannot be written: File too large", code=5)

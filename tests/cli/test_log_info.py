@@ -1,4 +1,6 @@
-"""`trilat log info`, `trilat log check` and what every reading command says of a file that is not whole."""
+"""`trilat log info`, `trilat log check`, and the message of every reading command about an
+incomplete file.
+"""
 
 import io
 import json
@@ -14,7 +16,7 @@ from trilat_net.presentation.untrusted_text import sanitize
 WHOLE = recorded("paper")
 
 
-def written(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
+def write_log(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
     path = folder / name
     path.write_bytes(data)
     return path
@@ -33,8 +35,8 @@ def foreign() -> bytes:
     return stream.getvalue()
 
 
-def test_info_tells_the_session_its_sites_links_and_channels(tmp_path: Path) -> None:
-    text = trilat("log", "info", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
+def test_info_shows_session_sites_links_and_channels(tmp_path: Path) -> None:
+    text = trilat("log", "info", write_log(tmp_path, WHOLE), cwd=tmp_path).succeeds()
     for fact in (
         "paper, virtual",
         "seed 1",
@@ -49,8 +51,8 @@ def test_info_tells_the_session_its_sites_links_and_channels(tmp_path: Path) -> 
     )
 
 
-def test_info_in_json_is_the_same_in_numbers(tmp_path: Path) -> None:
-    path = written(tmp_path, edited(WHOLE, record=without("m1", {5, 6, 90})))
+def test_info_in_json_has_the_same_numbers(tmp_path: Path) -> None:
+    path = write_log(tmp_path, edited(WHOLE, record=without("m1", {5, 6, 90})))
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "trilat"
     assert facts["session"]["scenario"]["name"] == "paper"
@@ -65,8 +67,8 @@ def test_info_in_json_is_the_same_in_numbers(tmp_path: Path) -> None:
     assert file["finished"]
 
 
-def test_info_of_a_file_of_others_tells_its_channels(tmp_path: Path) -> None:
-    path = written(tmp_path, foreign())
+def test_info_of_a_foreign_file_shows_channels(tmp_path: Path) -> None:
+    path = write_log(tmp_path, foreign())
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "mcap"
     assert facts["session"] is None
@@ -75,8 +77,8 @@ def test_info_of_a_file_of_others_tells_its_channels(tmp_path: Path) -> None:
     assert "/t" in trilat("log", "info", path, cwd=tmp_path).succeeds()
 
 
-def test_info_of_an_unreadable_log_says_why(tmp_path: Path) -> None:
-    path = written(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
+def test_info_of_an_unreadable_log_gives_reasons(tmp_path: Path) -> None:
+    path = write_log(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
     text = trilat("log", "info", path, cwd=tmp_path).succeeds()
     assert "cannot be opened" in text
     assert "is not TOML" in text
@@ -84,36 +86,36 @@ def test_info_of_an_unreadable_log_says_why(tmp_path: Path) -> None:
 
 
 def test_a_sound_log_passes_every_check(tmp_path: Path) -> None:
-    text = trilat("log", "check", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
+    text = trilat("log", "check", write_log(tmp_path, WHOLE), cwd=tmp_path).succeeds()
     assert [line.split()[0] for line in text.splitlines()] == ["ok"] * 11
 
 
-def test_a_log_that_lacks_records_fails_and_names_them(tmp_path: Path) -> None:
-    path = written(tmp_path, edited(WHOLE, record=without("s", {7, 8, 9, 40})))
+def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
+    path = write_log(tmp_path, edited(WHOLE, record=without("s", {7, 8, 9, 40})))
     done = trilat("log", "check", path, cwd=tmp_path)
     assert done.code == 1
     assert "FAIL sequence" in done.out
     assert "missing s/state 7-9" in done.out
-    found = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
-    assert not found["sound"]
-    (sequence,) = (each for each in found["checks"] if each["check"] == "sequence")
-    assert {place["text"] for place in sequence["places"]} == {
+    facts = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
+    assert not facts["sound"]
+    (sequence,) = (each for each in facts["checks"] if each["check"] == "sequence")
+    assert {gap["text"] for gap in sequence["places"]} == {
         "missing s/state 7-9",
         "missing s/state 40",
     }
 
 
-def test_a_foreign_mcap_file_is_checked_for_its_structure(tmp_path: Path) -> None:
-    done = trilat("log", "check", written(tmp_path, foreign()), cwd=tmp_path)
+def test_foreign_mcap_files_are_checked_for_structure(tmp_path: Path) -> None:
+    done = trilat("log", "check", write_log(tmp_path, foreign()), cwd=tmp_path)
     assert done.code == 0
     assert len(done.out.splitlines()) == 4
     assert "not a trilat-net log" in done.err
 
 
-def test_no_mcap_file_is_bad_input_or_a_finding(tmp_path: Path) -> None:
+def test_missing_and_foreign_files_are_refused_or_fail(tmp_path: Path) -> None:
     for command in ("info", "check"):
         trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
-    path = written(tmp_path, b"text")
+    path = write_log(tmp_path, b"text")
     trilat("log", "info", path, cwd=tmp_path).refuses("is not an MCAP file")
     assert trilat("log", "check", path, cwd=tmp_path).code == 1
 
@@ -121,18 +123,18 @@ def test_no_mcap_file_is_bad_input_or_a_finding(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "command", [["log", "info"], ["log", "check"], ["verify"]], ids=" ".join
 )
-def test_every_command_says_what_mends_a_torn_file(command: list[str], tmp_path: Path) -> None:
+def test_every_command_names_the_repair(command: list[str], tmp_path: Path) -> None:
     data = edited(WHOLE, chunk_bytes=4096)
-    path = written(tmp_path, data[: len(data) // 2], "run.mcap.active")
+    path = write_log(tmp_path, data[: len(data) // 2], "run.mcap.active")
     done = trilat(*command, path, cwd=tmp_path)
     notes = [line for line in done.err.splitlines() if line.startswith("note: ")]
     assert len(notes) == 1, done
     assert f"trilat log recover {path}" in notes[0]
 
 
-def test_verify_names_every_gap_and_goes_on_behind_it(tmp_path: Path) -> None:
+def test_verify_names_every_gap_and_continues(tmp_path: Path) -> None:
     lost = {3 * n for n in range(10, 30)}
-    path = written(tmp_path, edited(WHOLE, record=without("m2", lost)))
+    path = write_log(tmp_path, edited(WHOLE, record=without("m2", lost)))
     done = trilat("verify", path, cwd=tmp_path)
     assert done.code == 1, done  # nothing differs, and too much is missing
     assert f"m2 {', '.join(map(str, sorted(lost)))}" in done.out
@@ -147,11 +149,11 @@ def test_verify_names_every_gap_and_goes_on_behind_it(tmp_path: Path) -> None:
     assert 0 < facts["unjudged"] < 150
 
 
-def test_what_a_file_says_reaches_no_terminal_as_it_is(tmp_path: Path) -> None:
-    """An escape sequence in a name could clear the screen, or write what was never there."""
+def test_file_contents_reach_terminals_only_escaped(tmp_path: Path) -> None:
+    """An escape sequence in a name could clear the screen, or write text that was never there."""
     assert sanitize("\x1b[2Jred\r\n") == "\ufffd[2Jred\ufffd\ufffd"
     assert len(sanitize("x" * 10_000)) < 400
-    path = written(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
+    path = write_log(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
     done = trilat("log", "info", path, cwd=tmp_path)
     assert "\x1b" not in done.out + done.err
     assert "\x07" not in done.out + done.err
@@ -170,21 +172,21 @@ READING = (
 )
 
 
-@pytest.mark.parametrize("words", READING, ids=" ".join)
-def test_an_empty_file_is_empty_to_every_command(words: list[str], tmp_path: Path) -> None:
-    written(tmp_path, b"", "empty.mcap")
-    done = trilat(*words, "empty.mcap", cwd=tmp_path)
+@pytest.mark.parametrize("arguments", READING, ids=" ".join)
+def test_an_empty_file_is_empty_to_every_command(arguments: list[str], tmp_path: Path) -> None:
+    write_log(tmp_path, b"", "empty.mcap")
+    done = trilat(*arguments, "empty.mcap", cwd=tmp_path)
     assert done.code != 0
     assert "is empty" in done.out + done.err
     assert "trilat log recover" not in done.out + done.err  # it could save nothing
     assert list(tmp_path.iterdir()) == [tmp_path / "empty.mcap"]
 
 
-def test_bytes_behind_the_end_lose_nothing(tmp_path: Path) -> None:
+def test_trailing_bytes_lose_nothing(tmp_path: Path) -> None:
     data = PADDED.read_bytes()
-    written(tmp_path, data, "padded.mcap")
-    for words in (["log", "info"], ["log", "check"]):
-        done = trilat(*words, "padded.mcap", cwd=tmp_path)
+    write_log(tmp_path, data, "padded.mcap")
+    for command in (["log", "info"], ["log", "check"]):
+        done = trilat(*command, "padded.mcap", cwd=tmp_path)
         assert "was finished, and 512 bytes follow its end mark" in done.err, done
         assert "was not finished" not in done.out + done.err
     done = trilat("log", "recover", "padded.mcap", cwd=tmp_path)
@@ -196,25 +198,25 @@ def test_bytes_behind_the_end_lose_nothing(tmp_path: Path) -> None:
     assert "512 bytes" not in checked.out + checked.err
 
 
-def test_a_padded_log_is_verified_as_it_is(tmp_path: Path) -> None:
-    written(tmp_path, WHOLE + bytes(4096))
-    for words in (["log", "info"], ["verify"]):
-        done = trilat(*words, "run.mcap", cwd=tmp_path)
+def test_a_padded_log_is_verified(tmp_path: Path) -> None:
+    write_log(tmp_path, WHOLE + bytes(4096))
+    for command in (["log", "info"], ["verify"]):
+        done = trilat(*command, "run.mcap", cwd=tmp_path)
         assert done.code == 0, done
         assert "4096 bytes follow its end mark" in done.err, done
     assert trilat("log", "recover", "run.mcap", cwd=tmp_path).code == 0
 
 
 def without_ends(payload: bytes) -> bytes:
-    """An event that is no end, in the place of one."""
+    """Returns an event that is no end, in the place of an end."""
     return payload.replace(b"\xa3end", b"\xa3law")
 
 
-def test_an_unknown_end_is_said_everywhere(tmp_path: Path) -> None:
-    written(tmp_path, edited(WHOLE, event=without_ends))
+def test_an_unknown_end_is_reported_everywhere(tmp_path: Path) -> None:
+    write_log(tmp_path, edited(WHOLE, event=without_ends))
     sentence = "the end of m1, m2 and s is unknown"
-    for words in (["log", "info"], ["log", "check"], ["verify"]):
-        done = trilat(*words, "run.mcap", cwd=tmp_path)
+    for command in (["log", "info"], ["log", "check"], ["verify"]):
+        done = trilat(*command, "run.mcap", cwd=tmp_path)
         assert sentence in done.out + done.err, done
     facts = json.loads(trilat("log", "info", "run.mcap", "--json", cwd=tmp_path).out)
     assert facts["session"]["unknown_ends"] == ["m1", "m2", "s"]

@@ -11,7 +11,7 @@ from .running import trilat
 @pytest.mark.parametrize(
     ("views", "least", "most"), [("off", 0, 0), ("50", 13, 14), ("full", 250, 250)]
 )
-def test_a_simulation_shows_itself_as_often_as_asked(
+def test_a_simulation_has_views_at_the_asked_rate(
     tmp_path: Path, views: str, least: int, most: int
 ) -> None:
     duration = ("--duration", "0.25", "-o", "x.mcap")
@@ -23,7 +23,7 @@ def test_a_simulation_shows_itself_as_often_as_asked(
 
 @pytest.mark.parametrize("views", ["0", "-1", "nan", "inf", "fast", ""])
 @pytest.mark.parametrize("command", [("sim", "two_sites"), ("record", "--session", "x")])
-def test_a_rate_that_is_none_is_refused(
+def test_an_invalid_rate_is_refused(
     tmp_path: Path, command: tuple[str, ...], views: str
 ) -> None:
     done = trilat(*command, "--views", views, cwd=tmp_path)
@@ -32,8 +32,8 @@ def test_a_rate_that_is_none_is_refused(
 
 
 @pytest.mark.long
-def test_what_is_shown_can_be_kept(log_file: Path, tmp_path: Path) -> None:
-    """Of a log without views as well."""
+def test_views_can_be_kept(log_file: Path, tmp_path: Path) -> None:
+    """Also from a log without views."""
     text = trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).succeeds()
     assert "run.rrd: open it with: rerun run.rrd" in text
     assert (tmp_path / "run.rrd").read_bytes().startswith(b"RRF2")

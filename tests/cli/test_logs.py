@@ -1,4 +1,4 @@
-"""`sim`, `verify` and `report`: files that are the same, files that were changed, files that are torn."""
+"""`sim`, `verify` and `report` on equal files, changed files and torn files."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from trilat_net.log.log_reader import open_log
 from .running import trilat
 
 
-def test_two_runs_of_one_scenario_and_seed_are_same_file(tmp_path: Path) -> None:
+def test_runs_of_one_seed_are_the_same_file(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         trilat("sim", "two_sites", "--duration", "1", "-o", name, cwd=tmp_path).succeeds()
     trilat(
@@ -25,7 +25,7 @@ def test_two_runs_of_one_scenario_and_seed_are_same_file(tmp_path: Path) -> None
     assert (log.complete, log.driver, len(log["m"])) == (True, "virtual", 1000)
 
 
-def test_a_log_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
+def test_existing_logs_are_kept_unless_forced(tmp_path: Path) -> None:
     path = tmp_path / "two_sites.mcap"  # the name that it has by default
     path.write_bytes(b"precious")
     trilat("sim", "two_sites", "--duration", "0.1", cwd=tmp_path).refuses(
@@ -36,7 +36,7 @@ def test_a_log_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
     assert open_log(path).complete
 
 
-def test_a_run_that_diverges_says_so_and_exits_with_1(tmp_path: Path) -> None:
+def test_a_diverging_run_exits_1(tmp_path: Path) -> None:
     done = trilat(
         "sim", "paper", "--set", "limits.qd_limit_rad_s=0.5", "-o", "d.mcap", cwd=tmp_path
     )
@@ -54,7 +54,7 @@ def test_verify_compares_with_virtual_time_too(log_file: Path) -> None:
     assert "0 late samples" in text
 
 
-def test_verify_names_the_first_record_that_differs(log_file: Path, short_log: bytes) -> None:
+def test_verify_names_the_first_different_record(log_file: Path, short_log: bytes) -> None:
     def record(r: dict[str, Any]) -> dict[str, Any]:
         if (r["site"], r["tick"]) == ("m2", 300):
             # the last bit of the first torque
@@ -70,7 +70,7 @@ def test_verify_names_the_first_record_that_differs(log_file: Path, short_log: b
     assert "Traceback" not in done.err
 
 
-def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: bytes) -> None:
+def test_verify_notices_another_gain(log_file: Path, short_log: bytes) -> None:
     def gain(text: str) -> str:
         assert "Kd = [3.0, 3.0]" in text
         return text.replace("Kd = [3.0, 3.0]", "Kd = [3.5, 3.0]", 1)
@@ -82,7 +82,7 @@ def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: 
     assert "scenario" in done.err
 
 
-def test_a_torn_log_is_verified_as_far_as_whole(tmp_path: Path) -> None:
+def test_torn_logs_are_verified_as_far_as_whole(tmp_path: Path) -> None:
     path = tmp_path / "torn.mcap"
     trilat("sim", "paper", "--duration", "2", "-o", path, cwd=tmp_path).succeeds()
     whole = path.read_bytes()
@@ -103,9 +103,7 @@ def test_a_torn_log_is_verified_as_far_as_whole(tmp_path: Path) -> None:
     )
 
 
-def test_log_torn_before_its_first_record_shows_nothing_and_fails(
-    log_file: Path, short_log: bytes
-) -> None:
+def test_log_torn_before_its_first_record_fails(log_file: Path, short_log: bytes) -> None:
     log_file.write_bytes(short_log[: len(short_log) * 2 // 3])  # inside its only chunk
     done = trilat("verify", log_file, cwd=log_file.parent)
     done_text = done.out + done.err
@@ -125,7 +123,7 @@ JITTER = (
 
 
 @pytest.mark.long
-def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> None:
+def test_reports_lie_beside_logs_and_keep_files(tmp_path: Path) -> None:
     sim = ("sim", "two_sites", "--duration", "1", "--set", "rate_hz=200", "-o", "run.mcap")
     trilat(*sim, *JITTER, cwd=tmp_path).succeeds()
     before = (tmp_path / "run.mcap").read_bytes()
@@ -145,10 +143,10 @@ def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> N
         "summary.json",
     }
     assert "  run/summary.json" in text.splitlines()
-    drawn = trilat("report", "run.mcap", "-o", "drawn", "--png", cwd=tmp_path).succeeds()
+    output = trilat("report", "run.mcap", "-o", "drawn", "--png", cwd=tmp_path).succeeds()
     pictures = {f"  drawn/{path.name}" for path in (tmp_path / "drawn").glob("*.png")}
     assert "  drawn/certificate.png" in pictures
-    assert pictures <= set(drawn.splitlines())
+    assert pictures <= set(output.splitlines())
     links = [line for line in text.splitlines() if line.startswith("link ")]
     assert [
         line.partition(": stated uniform 50 +- 23.1 ms; effective ")[0] for line in links
@@ -163,7 +161,7 @@ def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_report_into_folder_of_its_log_keeps_log(log_file: Path) -> None:
+def test_a_report_in_the_folder_keeps_its_log(log_file: Path) -> None:
     before = log_file.read_bytes()
     done = trilat("report", log_file, "-o", log_file.parent, "--force", cwd=log_file.parent)
     assert done.code == 0, done
@@ -171,7 +169,7 @@ def test_report_into_folder_of_its_log_keeps_log(log_file: Path) -> None:
     assert (log_file.parent / "report.html").exists()
 
 
-def test_a_name_that_is_no_file_is_left_alone(tmp_path: Path) -> None:
+def test_a_wrong_name_is_left_alone(tmp_path: Path) -> None:
     done = trilat(
         "sim", "two_sites", "--duration", "0.1", "-o", "/dev/full", "--force", cwd=tmp_path
     )

@@ -16,19 +16,19 @@ from tests.cli.running import started, trilat
 def test_the_skeleton_is_a_law_and_replaces_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = trilat("new", "law", "soft_law.py", cwd=tmp_path)
-    assert made.code == 0
-    assert "--set control.law=soft_law:SoftLaw" in made.out
-    assert "python -m pytest test_soft_law.py" in made.out
-    assert "trilat report soft_law.mcap --law soft_law.py" in made.out
+    ended = trilat("new", "law", "soft_law.py", cwd=tmp_path)
+    assert ended.code == 0
+    assert "--set control.law=soft_law:SoftLaw" in ended.out
+    assert "python -m pytest test_soft_law.py" in ended.out
+    assert "trilat report soft_law.mcap --law soft_law.py" in ended.out
     head = (tmp_path / "soft_law.py").read_text().split('"""')[1]
-    printed = [line.strip() for line in made.out.splitlines() if line.startswith("  trilat")]
+    printed = [line.strip() for line in ended.out.splitlines() if line.startswith("  trilat")]
     assert len(printed) == 3
     assert [line for line in head.splitlines() if line.startswith("trilat")] == printed
     monkeypatch.chdir(tmp_path)
     log = tn.simulate("free", {"control.law": "soft_law:SoftLaw"}, duration_s=0.5)
-    apart = [np.ptp([log[site].q[at, 0] for site in log.scenario.names]) for at in (0, -1)]
-    assert apart[1] < 0.6 * apart[0]
+    spreads = [np.ptp([log[site].q[at, 0] for site in log.scenario.names]) for at in (0, -1)]
+    assert spreads[1] < 0.6 * spreads[0]
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("soft_law.py", "exists")
     (tmp_path / "soft_law.py").unlink()
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("test_soft_law.py", "exists")
@@ -36,12 +36,12 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("such as mylaw.py or my_law.py")
 
 
-def test_a_law_that_is_compiled_anew_needs_no_notice(tmp_path: Path) -> None:
+def test_laws_compiled_anew_need_no_notice(tmp_path: Path) -> None:
     """The core is in the cache after the first run; the law is compiled by every process."""
     trilat("new", "law", "swift.py", cwd=tmp_path)
-    words = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
-    trilat(*words, "-o", "first.mcap", cwd=tmp_path).succeeds()
-    run = started(*words, "-o", "second.mcap", cwd=tmp_path)
+    arguments = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
+    trilat(*arguments, "-o", "first.mcap", cwd=tmp_path).succeeds()
+    run = started(*arguments, "-o", "second.mcap", cwd=tmp_path)
     out, err = run.communicate()
     assert "second.mcap" in out
     assert "compiling" not in err
@@ -62,14 +62,14 @@ def test_the_test_of_the_skeleton_passes(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_report_judges_a_permitted_law_as_certify_does(tmp_path: Path) -> None:
-    made = trilat("new", "law", "mine.py", cwd=tmp_path)
-    assert "trilat certify mine.mcap --law mine.py" in made.out
+def test_reports_judge_permitted_laws_like_certify(tmp_path: Path) -> None:
+    ended = trilat("new", "law", "mine.py", cwd=tmp_path)
+    assert "trilat certify mine.mcap --law mine.py" in ended.out
     run = ["sim", "free", "--set", "control.law=mine:Mine", "--duration", "8"]
     trilat(*run, "-o", "mine.mcap", cwd=tmp_path).succeeds()
     allowed = ["mine.mcap", "--law", "mine.py", "--json"]
     certified = json.loads(trilat("certify", *allowed, cwd=tmp_path).out)
-    (printed,) = (line for line in made.out.splitlines() if "trilat certify" in line)
+    (printed,) = (line for line in ended.out.splitlines() if "trilat certify" in line)
     assert trilat(*shlex.split(printed)[1:], cwd=tmp_path).code == 0
     assert trilat("certify", *allowed, cwd=tmp_path).code == 1, "settled is not stable"
     reported = json.loads(trilat("report", *allowed, cwd=tmp_path).out)
@@ -85,13 +85,13 @@ def test_report_judges_a_permitted_law_as_certify_does(tmp_path: Path) -> None:
     ],
 )
 def test_skeletons_of_hand_and_plant_run(kind: str, key: str, tmp_path: Path) -> None:
-    made = trilat("new", kind, f"my_{kind}.py", cwd=tmp_path)
-    assert made.code == 0
-    assert key in made.out
+    ended = trilat("new", kind, f"my_{kind}.py", cwd=tmp_path)
+    assert ended.code == 0
+    assert key in ended.out
     trilat("new", kind, f"my_{kind}.py", cwd=tmp_path).refuses(f"my_{kind}.py", "exists")
-    command = next(line.strip() for line in made.out.splitlines() if "trilat sim" in line)
-    words = [*shlex.split(command)[1:], "--duration", "0.5"]
-    ran = trilat(*words, cwd=tmp_path)
+    command = next(line.strip() for line in ended.out.splitlines() if "trilat sim" in line)
+    arguments = [*shlex.split(command)[1:], "--duration", "0.5"]
+    ran = trilat(*arguments, cwd=tmp_path)
     assert ran.code == 0, ran.err
     assert trilat("verify", f"my_{kind}.mcap", cwd=tmp_path).code == 0
 

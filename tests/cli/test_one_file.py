@@ -1,4 +1,4 @@
-"""A command, and the study behind it, are one file: the program knows one that was put beside the others."""
+"""A command and its study are one file: the program finds a command that was put beside the others."""
 
 from pathlib import Path
 
@@ -71,12 +71,12 @@ print(json.dumps({
 """
 
 
-def test_file_beside_others_is_command_and_its_study(tmp_path: Path) -> None:
+def test_an_added_file_is_command_and_study(tmp_path: Path) -> None:
     put_beside(tmp_path, "app/cli", "lag.py", STUDY)
-    found = look(LOOK, tmp_path)
-    assert "Measures how far the slave lags, seed by seed." in found["listed"]
-    assert "lag" in found["listed"].partition("─ Make your own ─")[2]
-    assert "Example: trilat lag paper --seeds 3" in found["help"]
-    assert found["first"]["made"] == 2
-    assert found["again"]["made"] == 1  # the journal has the others
-    assert set(found["first"]["rows"]) < set(found["again"]["rows"]) == {"0", "1", "2"}
+    output = look(LOOK, tmp_path)
+    assert "Measures how far the slave lags, seed by seed." in output["listed"]
+    assert "lag" in output["listed"].partition("─ Make your own ─")[2]
+    assert "Example: trilat lag paper --seeds 3" in output["help"]
+    assert output["first"]["made"] == 2
+    assert output["again"]["made"] == 1  # the journal has the others
+    assert set(output["first"]["rows"]) < set(output["again"]["rows"]) == {"0", "1", "2"}

@@ -1,4 +1,4 @@
-"""Laws and arms from outside, by commands: what works, and one sentence where it does not."""
+"""Laws and arms from outside, by commands: working examples, and one sentence for each failure."""
 
 import csv
 import re
@@ -22,19 +22,19 @@ SHORT = ("--duration", "0.1")
 
 
 def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
-    assert found is not None
-    return found[1]
+    match = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
+    assert match is not None
+    return match[1]
 
 
-def test_the_page_does_as_it_says(tmp_path: Path) -> None:
+def test_the_page_works_as_written(tmp_path: Path) -> None:
     code = block("python")
     assert len([line for line in code.splitlines() if line]) <= 30
     (tmp_path / "mylaws.py").write_text(code)
     commands = [shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()]
     sim, certify, report, verify, demo = commands
-    for words in (certify, report):
-        assert words[words.index("--law") + 1] == "mylaws.py"
+    for arguments in (certify, report):
+        assert arguments[arguments.index("--law") + 1] == "mylaws.py"
     trilat(*sim, "--duration", "2", cwd=tmp_path).succeeds()
     log = open_log(tmp_path / "spring.mcap")
     assert {site.control.settings["K"] for site in log.scenario.sites.values()} == {80}
@@ -46,13 +46,13 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
     assert "6000/6000 records identical" in checked.out
     assert "mylaws:Spring of m1, m2, s with K = 80; its file is the one that ran" in checked.out
     assert demo[:2] == ["demo", "paper"]
-    shown = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
-    shown.succeeds()
+    ended = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
+    ended.succeeds()
     assert open_log(tmp_path / "slave.mcap").scenario.sites["m1"].control.Kd == (3.0, 3.0)
 
 
 @pytest.mark.long
-def test_law_of_page_holds_arms_together_as_it_says(
+def test_the_documented_law_holds_arms_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -71,7 +71,7 @@ def test_law_of_page_holds_arms_together_as_it_says(
 
 
 @pytest.mark.long
-def test_certificate_of_page_is_printed(tmp_path: Path) -> None:
+def test_the_documented_certificate_is_printed(tmp_path: Path) -> None:
     (tmp_path / "mylaws.py").write_text(block("python"))
     sim, certify, *_ = (
         shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()
@@ -91,22 +91,24 @@ def read_input_table() -> list[tuple[str, str, str]]:
     rows = re.findall(r"^\| (`now\..*?) \| (.*?) \| (.*?) \|", DOC.read_text("utf-8"), re.M)
     fields = []
     for names, shape, units in rows:
-        found = re.findall(r"`now\.(\w+)`", names)
-        stated = units.split(", ") if ", " in units else [units] * len(found)
+        matches = re.findall(r"`now\.(\w+)`", names)
+        stated = units.split(", ") if ", " in units else [units] * len(matches)
         stated = ["" if unit == "–" else unit for unit in stated]
-        fields += [(name, shape, unit) for name, unit in zip(found, stated, strict=True)]
+        fields += [(name, shape, unit) for name, unit in zip(matches, stated, strict=True)]
     return fields
 
 
-def test_units_of_page_are_those_of_the_interface() -> None:
+def test_documented_units_are_those_of_the_interface() -> None:
     with INPUTS.open(newline="", encoding="utf-8") as stream:
         units = {row["field"]: row["unit"] for row in csv.DictReader(stream)}
     table = read_input_table()
     assert len(table) == 11
-    assert [(name, unit) for name, _, unit in table] == [(one, units[one]) for one, *_ in table]
+    assert [(name, unit) for name, _, unit in table] == [
+        (name_in_table, units[name_in_table]) for name_in_table, *_ in table
+    ]
 
 
-def test_shapes_of_page_are_what_a_law_gets(tmp_path: Path) -> None:
+def test_documented_shapes_are_those_of_a_law(tmp_path: Path) -> None:
     sizes = {"n": "len({}) == now.joints", "a number": "{} + 0.0 == {}"}
     checks = [
         f"        assert {sizes[shape].format(f'now.{name}', f'now.{name}')}, {name!r}"
@@ -130,7 +132,7 @@ def test_shapes_of_page_are_what_a_law_gets(tmp_path: Path) -> None:
     ).succeeds()
 
 
-def test_what_page_says_of_law_is_what_law_gets() -> None:
+def test_a_law_gets_the_documented_values() -> None:
     from trilat_net.core.plug.user_law import LawContext, LawInput
 
     with INPUTS.open(newline="", encoding="utf-8") as stream:
@@ -151,7 +153,7 @@ def law(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     return file
 
 
-def test_before_code_from_outside_runs_it_is_said_which(law: Path, tmp_path: Path) -> None:
+def test_outside_code_is_named_before_running(law: Path, tmp_path: Path) -> None:
     for command in (["verify"], ["verify", "--json"], ["rerun", "--closed-loop"]):
         done = trilat(command[0], "two_sites.mcap", *command[1:], "--law", law, cwd=tmp_path)
         assert done.code == 0
@@ -159,7 +161,7 @@ def test_before_code_from_outside_runs_it_is_said_which(law: Path, tmp_path: Pat
         assert f"{law.stem}:Law of m, s; its file is the one that ran" in done.err
 
 
-def test_a_law_whose_file_was_changed_is_judged_on_request(law: Path, tmp_path: Path) -> None:
+def test_changed_laws_are_judged_on_request(law: Path, tmp_path: Path) -> None:
     law.write_text(law.read_text() + "# a word\n")
     how = ("--law", law, "--other-version")
     trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses(
@@ -179,7 +181,7 @@ def test_a_law_whose_file_was_changed_is_judged_on_request(law: Path, tmp_path: 
     assert "differ, the first: m, tick " in done.err
 
 
-def test_a_law_whose_file_is_not_there_is_not_judged(law: Path, tmp_path: Path) -> None:
+def test_missing_laws_are_not_judged(law: Path, tmp_path: Path) -> None:
     law.unlink()
     done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
     assert done.code == 4
@@ -189,7 +191,7 @@ def test_a_law_whose_file_is_not_there_is_not_judged(law: Path, tmp_path: Path) 
     )
 
 
-def test_a_log_is_read_without_the_code_that_it_names(law: Path, tmp_path: Path) -> None:
+def test_logs_are_read_without_their_code(law: Path, tmp_path: Path) -> None:
     law.unlink()
     assert (
         "200, none missing" in trilat("log", "info", "two_sites.mcap", cwd=tmp_path).succeeds()
@@ -205,7 +207,7 @@ def test_a_log_is_read_without_the_code_that_it_names(law: Path, tmp_path: Path)
     assert done.code == 0
 
 
-def test_run_whose_law_fails_is_one_sentence_and_finished_log(tmp_path: Path) -> None:
+def test_failing_laws_give_one_sentence_and_a_log(tmp_path: Path) -> None:
     done = trilat("sim", "two_sites", *SHORT, *FAILING, cwd=tmp_path)
     done.refuses("tests.laws:Failing of s failed at tick 40: torque[1] is nan", code=1)
     assert open_log(tmp_path / "two_sites.mcap").complete
@@ -215,7 +217,7 @@ def test_run_whose_law_fails_is_one_sentence_and_finished_log(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("seeds", ["1", pytest.param("1..3", marks=pytest.mark.long)])
-def test_a_trial_whose_law_fails_is_a_trial_that_failed(seeds: str, tmp_path: Path) -> None:
+def test_a_failing_law_fails_its_trial(seeds: str, tmp_path: Path) -> None:
     jitter = (
         "--set",
         "link.model=uniform",
@@ -230,7 +232,7 @@ def test_a_trial_whose_law_fails_is_a_trial_that_failed(seeds: str, tmp_path: Pa
     assert "tests.laws:Failing of s failed at tick 40: torque[1] is nan" in done.out
 
 
-def test_a_rerun_whose_law_fails_is_one_sentence(tmp_path: Path) -> None:
+def test_failing_laws_in_reruns_are_one_sentence(tmp_path: Path) -> None:
     trilat("sim", "two_sites", *SHORT, cwd=tmp_path).succeeds()
     trilat("rerun", "two_sites.mcap", "--replace", "s", *FAILING, cwd=tmp_path).refuses(
         "tests.laws:Failing of s failed at tick 40", code=1
@@ -238,7 +240,7 @@ def test_a_rerun_whose_law_fails_is_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
-def test_an_arm_outside_cannot_be_executed_afresh(how: list[str], tmp_path: Path) -> None:
+def test_external_arms_cannot_be_executed_again(how: list[str], tmp_path: Path) -> None:
     (tmp_path / "outside.mcap").write_bytes(external_log())
     trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses(
         "sites.s.plant", "as in --replace m"

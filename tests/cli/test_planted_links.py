@@ -1,4 +1,4 @@
-"""No command writes through a symbolic link that somebody has planted in place of its outputs."""
+"""No command writes through a symbolic link that somebody planted in place of its outputs."""
 
 import shutil
 from pathlib import Path
@@ -86,7 +86,7 @@ def list_content(folder: Path) -> dict[Path, bytes | None]:
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         pytest.param(
             words, id=" ".join(words[:6]), marks=[] if words[0] in QUICK else [pytest.mark.long]
@@ -94,20 +94,20 @@ def list_content(folder: Path) -> dict[Path, bytes | None]:
         for words in CASES
     ],
 )
-def test_planted_links_lead_no_command_elsewhere(
-    words: list[str], inputs: Path, tmp_path: Path
+def test_planted_links_redirect_no_command(
+    arguments: list[str], inputs: Path, tmp_path: Path
 ) -> None:
     """Runs the command, puts links in place of each of its outputs, and runs it again."""
     work, victim = tmp_path / "work", tmp_path / "victim"
     shutil.copytree(inputs, work)
-    if words[0] == "experiment" and words[1] != "new":
+    if arguments[0] == "experiment" and arguments[1] != "new":
         trilat("experiment", "new", "reaching.toml", cwd=work).succeeds()
         shorten(work / "reaching.toml")
-        if words[1] == "analyse":
+        if arguments[1] == "analyse":
             run = ["experiment", "run", "reaching.toml", "--jobs", "1", "-o", "experiment"]
             trilat(*run, cwd=work).succeeds()
     before = list_content(work)
-    first = trilat(*words, cwd=work)
+    first = trilat(*arguments, cwd=work)
     assert first.code in (0, 1), first
     outputs = sorted(path for path in list_content(work) if path not in before)
     assert outputs
@@ -119,12 +119,12 @@ def test_planted_links_lead_no_command_elsewhere(
         is_folder = (again / output).is_dir()
         shutil.rmtree(again / output) if is_folder else (again / output).unlink()
         (again / output).symlink_to(victim if is_folder else victim / "thesis.tex")
-        done = trilat(*words, cwd=again)
+        done = trilat(*arguments, cwd=again)
         assert "Traceback" not in done.err, output
         assert (victim / "thesis.tex").read_text() == "years", output
         # people link such folders to larger disks
         own = is_folder and str(output) in (
-            *words,
+            *arguments,
             "runs",
         )
         assert own or [path.name for path in victim.iterdir()] == ["thesis.tex"], output

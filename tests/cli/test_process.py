@@ -1,4 +1,4 @@
-"""What the command is as a process: pipes, Ctrl-C, what it imports."""
+"""The command as a process: pipes, Ctrl-C, imports."""
 
 import errno
 import io
@@ -24,7 +24,7 @@ from .running import PLAIN, started, trilat
 
 
 @pytest.mark.parametrize("command", [["scenario", "show", "paper"], ["sim", "--help"]])
-def test_a_reader_that_had_enough_is_no_error(command: list[str], tmp_path: Path) -> None:
+def test_a_closed_pipe_is_no_error(command: list[str], tmp_path: Path) -> None:
     process = started(*command, cwd=tmp_path)
     assert process.stdout is not None
     process.stdout.close()
@@ -32,7 +32,7 @@ def test_a_reader_that_had_enough_is_no_error(command: list[str], tmp_path: Path
     assert err == ""
 
 
-def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> None:
+def test_ctrl_c_while_computing_exits_130_quietly(tmp_path: Path) -> None:
     process = started("sim", "paper", "--duration", "2000", "-o", "long.mcap", cwd=tmp_path)
     path = tmp_path / "long.mcap.active"
     until(lambda: path.exists() and path.stat().st_size > 100_000, timeout_s=60)
@@ -61,8 +61,10 @@ __main__.main()
 """
 
 
-def test_process_that_zenoh_still_calls_ends_with_its_own_code() -> None:
-    """One whose session nobody has closed; it would mostly be aborted, as a closed one is now and then."""
+def test_exit_codes_survive_late_calls_of_zenoh() -> None:
+    """The session is left open; the process would mostly be aborted, and sometimes even after
+    closing the session.
+    """
     endpoints = find_free_endpoints(1)
     with closing(ZenohBus(endpoints)) as bus:
         put = bus.publisher("key")
@@ -82,7 +84,7 @@ sys.exit(5)
 """
 
 
-def test_program_that_called_the_command_ends_with_its_own_code() -> None:
+def test_calling_programs_end_with_their_own_code() -> None:
     assert subprocess.run([sys.executable, "-c", GOES_ON], check=False).returncode == 5
 
 
@@ -104,8 +106,8 @@ assert not imported & {{"zenoh", "sites", "recorder", "live"}}, imported
 
 
 def elsewhere(folder: Path, *commands: str) -> str:
-    """Runs commands with nothing but what every system has; returns what they print, as UTF-8."""
-    program = PROGRAM.format(commands=[words.split() for words in commands])
+    """Runs commands with only those modules that every system has; returns their output as UTF-8."""
+    program = PROGRAM.format(commands=[command.split() for command in commands])
     env = {**PLAIN, **prepare_process(folder / "start")}
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=folder, env=env, capture_output=True
@@ -114,7 +116,7 @@ def elsewhere(folder: Path, *commands: str) -> str:
     return done.stdout.decode("utf-8")
 
 
-def test_logs_and_studies_need_what_every_system_has(tmp_path: Path) -> None:
+def test_logs_and_studies_need_only_portable_modules(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(
         read_template().replace('title = "', 'title = "θ → 0: '), "utf-8"
     )
@@ -152,14 +154,14 @@ for line in ("import fcntl", "import termios", "from signal import SIGKILL", "im
 """
 
 
-def test_what_not_every_system_has_is_not_found(tmp_path: Path) -> None:
-    """The process above would otherwise show nothing."""
+def test_unportable_modules_are_hidden(tmp_path: Path) -> None:
+    """Otherwise the process above would prove nothing."""
     env = prepare_process(tmp_path / "start")
     subprocess.run([sys.executable, "-c", PROBE], cwd=tmp_path, env=env, check=True)
 
 
 class Terminal(io.TextIOWrapper):
-    """A terminal that knows the letters of Western Europe."""
+    """A terminal with the letters of Western Europe."""
 
     def isatty(self) -> bool:
         return True
@@ -169,7 +171,7 @@ class Terminal(io.TextIOWrapper):
     ("kind", "printed"),
     [(io.TextIOWrapper, "±1 → ≥ 2\n".encode()), (Terminal, b"\xb11 \\u2192 \\u2265 2\n")],
 )
-def test_what_is_printed_has_letters_on_every_system(
+def test_printed_text_has_letters_on_every_system(
     kind: type[io.TextIOWrapper], printed: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     into = io.BytesIO()
@@ -181,10 +183,10 @@ def test_what_is_printed_has_letters_on_every_system(
 
 
 @pytest.mark.parametrize(("name", "code"), [((), 0), (("a?b.mcap",), 2)])
-def test_a_closed_pipe_and_a_bad_name_as_on_windows(
+def test_closed_pipes_and_bad_names_on_windows(
     name: tuple[str, ...], code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both are EINVAL there."""
+    """Both are EINVAL on Windows."""
 
     def fail() -> None:
         raise OSError(errno.EINVAL, "Invalid argument", *name)
@@ -226,7 +228,9 @@ NEED_STUDIES = (
 
 
 def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
-    """All that it runs is imported without them; what needs one is refused before anything is done."""
+    """Everything that a robot runs is imported without these libraries; commands that need one
+    are refused at once.
+    """
     alone = [
         ("--help",),
         ("keys", "new", "keys", "m", "s"),
@@ -245,8 +249,8 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
     )
     ended = [line for line in done.stdout.splitlines() if line.startswith("ended with")]
     assert ended == [
-        *(f"ended with 0 {' '.join(words)}" for words in alone),
-        *(f"ended with 2 {' '.join(words)}" for words in NEED_STUDIES),
+        *(f"ended with 0 {' '.join(command)}" for command in alone),
+        *(f"ended with 2 {' '.join(command)}" for command in NEED_STUDIES),
     ], done.stderr
     refused = done.stderr.splitlines()
     assert len(refused) == len(NEED_STUDIES), done.stderr
@@ -257,7 +261,7 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"keys", "run.mcap"}
 
 
-def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
+def test_help_imports_no_heavy_library(tmp_path: Path) -> None:
     program = (
         "import sys, trilat_net.app.cli\n"
         "heavy = {'numba', 'numpy', 'zenoh', 'mcap', 'matplotlib', 'msgspec', 'jinja2'} & set(sys.modules)\n"
@@ -269,7 +273,7 @@ def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_text_with_square_brackets_is_printed_as_it_is(tmp_path: Path) -> None:
+def test_square_brackets_are_printed_literally(tmp_path: Path) -> None:
     done = trilat("sim", "[bold]x[/bold].toml", cwd=tmp_path)
     done.refuses("[bold]x[/bold].toml")
     done = trilat("sim", "two_sites", "--duration", "0.1", "-o", "[/red].mcap", cwd=tmp_path)

@@ -1,4 +1,4 @@
-"""The bar: for people, while it takes long, and gone afterwards."""
+"""The progress bar is shown to people during long work, and removed afterwards."""
 
 import io
 import json
@@ -26,13 +26,13 @@ def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.String
 
 
 def work() -> None:
-    with terminal_output.progress_bar("reading run.mcap") as told:
+    with terminal_output.progress_bar("reading run.mcap") as bar:
         for done in range(0, 101, 20):
-            told(done, 100)
+            bar(done, 100)
 
 
 @pytest.mark.parametrize(("interactive", "patience_s"), [(False, 1e6), (True, 1e6)])
-def test_no_bar_is_drawn_off_a_terminal_or_at_once(
+def test_no_bar_off_a_terminal_or_at_once(
     interactive: bool, patience_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream = terminal(monkeypatch, interactive=interactive)
@@ -42,14 +42,14 @@ def test_no_bar_is_drawn_off_a_terminal_or_at_once(
     assert stream.getvalue() == ""
 
 
-def test_lines_off_a_terminal_say_what_is_done_and_how_far(
+def test_lines_off_terminals_tell_work_and_progress(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stream = terminal(monkeypatch, interactive=False)
     monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.0)
     monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
-    with terminal_output.progress_bar("judging run.mcap") as told:
-        told(1, 4)
+    with terminal_output.progress_bar("judging run.mcap") as bar:
+        bar(1, 4)
         for _ in range(1000):
             if stream.getvalue().count("%") >= 2:
                 break
@@ -61,7 +61,7 @@ def test_lines_off_a_terminal_say_what_is_done_and_how_far(
     assert re.fullmatch(r"  25 %, \d+ s elapsed", others[-1])
 
 
-def test_lines_end_with_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_lines_end_with_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = terminal(monkeypatch, interactive=False)
     monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.01)
     monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
@@ -83,9 +83,9 @@ WORKING = [
 ]
 
 
-@pytest.mark.parametrize(("words", "line"), WORKING, ids=lambda value: str(value[0]))
-def test_work_off_a_terminal_is_announced_on_stderr_alone(
-    words: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("arguments", "line"), WORKING, ids=lambda value: str(value[0]))
+def test_progress_off_terminals_goes_to_stderr(
+    arguments: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulated(tmp_path, "paper", seconds="0.2")
 
@@ -95,12 +95,12 @@ def test_work_off_a_terminal_is_announced_on_stderr_alone(
         yield lambda _done, _total: None
 
     monkeypatch.setattr(terminal_output, "progress_lines", announce)
-    done = trilat(*words, cwd=tmp_path)
+    done = trilat(*arguments, cwd=tmp_path)
     assert line in done.err
     assert json.loads(done.out)
 
 
-def test_what_takes_long_has_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_work_has_a_bar_that_disappears(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = terminal(monkeypatch, interactive=True)
     monkeypatch.setattr(terminal_output, "PATIENCE_S", -1.0)
     monkeypatch.setattr(terminal_output, "_REDRAW_PERIOD_S", -1.0)

@@ -1,6 +1,7 @@
-"""Keys that do not fit: every row is a command with a folder of keys, and the reason for which it refuses.
+"""Unsuitable keys: every row is a command with a folder of keys, and the reason for the
+refusal.
 
-Nothing is reached: what is refused is refused before a connection is opened.
+Each refusal comes before a connection is opened.
 """
 
 import json
@@ -33,8 +34,10 @@ Change = Callable[[Path], object]
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys of a session, and as `old`, `early` and `others` such as have ended, begin later, are foreign."""
+def key_folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Makes keys of a session, and as `old`, `early` and `others` keys that have ended, begin
+    later, or are foreign.
+    """
     folder = tmp_path_factory.mktemp("keys")
     create_keys(folder / "k", MEMBERS_MADE)
     create_keys(folder / "others", MEMBERS_MADE)
@@ -46,8 +49,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def keys(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path / "made")
+def keys(key_folders: Path, tmp_path: Path) -> Path:
+    shutil.copytree(key_folders, tmp_path / "made")
     return tmp_path / "made" / "k"
 
 
@@ -74,14 +77,19 @@ OF_ANOTHER = [
 
 
 @pytest.mark.parametrize(
-    ("words", "whose", "due"), OF_ANOTHER, ids=lambda value: str(value)[:40]
+    ("arguments", "whose", "due"), OF_ANOTHER, ids=lambda value: str(value)[:40]
 )
-def test_a_command_takes_the_keys_of_who_it_is(
-    words: Sequence[str], whose: str, due: str, made: Path, tmp_path: Path
+def test_commands_take_the_keys_of_their_member(
+    arguments: Sequence[str], whose: str, due: str, key_folders: Path, tmp_path: Path
 ) -> None:
-    place = words.index("link") if "link" in words else len(words)
-    given = [*words[:place], "--keys", str(made / "k" / whose), *words[place:]]
-    trilat(*given, cwd=tmp_path).refuses(TWO_NAMES.format(whose, due))
+    insertion = arguments.index("link") if "link" in arguments else len(arguments)
+    command = [
+        *arguments[:insertion],
+        "--keys",
+        str(key_folders / "k" / whose),
+        *arguments[insertion:],
+    ]
+    trilat(*command, cwd=tmp_path).refuses(TWO_NAMES.format(whose, due))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -104,9 +112,11 @@ FROM_PYTHON = [
 
 
 @pytest.mark.parametrize(("act", "whose", "due"), FROM_PYTHON)
-def test_python_takes_the_keys_of_who_it_is(act: Any, whose: str, due: str, made: Path) -> None:
+def test_python_takes_the_keys_of_its_member(
+    act: Any, whose: str, due: str, key_folders: Path
+) -> None:
     with pytest.raises(UsageError, match=TWO_NAMES.removeprefix("--").format(whose, due)):
-        act(made / "k" / whose)
+        act(key_folders / "k" / whose)
 
 
 ENDPOINTS = [
@@ -126,10 +136,10 @@ ENDPOINTS = [
 
 
 @pytest.mark.parametrize(("option", "place", "reason"), ENDPOINTS)
-def test_an_endpoint_with_keys_is_encrypted_as_they_say(
-    option: str, place: str, reason: str, made: Path, tmp_path: Path
+def test_endpoints_with_keys_are_encrypted_as_stated(
+    option: str, place: str, reason: str, key_folders: Path, tmp_path: Path
 ) -> None:
-    trilat(*SITE, made / "k" / "m1", option, place, cwd=tmp_path).refuses(place, reason)
+    trilat(*SITE, key_folders / "k" / "m1", option, place, cwd=tmp_path).refuses(place, reason)
 
 
 ZENOH_FILES = [
@@ -150,21 +160,23 @@ ZENOH_FILES = [
 
 
 @pytest.mark.parametrize(("text", "reason"), ZENOH_FILES)
-def test_ones_own_zenoh_settings_do_not_loosen_keys(
-    text: str, reason: str, made: Path, tmp_path: Path
+def test_a_users_zenoh_settings_cannot_loosen_keys(
+    text: str, reason: str, key_folders: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "own.json5"
     file.write_text(text)
-    trilat(*SITE, made / "k" / "m1", "--zenoh-config", file, cwd=tmp_path).refuses(reason)
+    trilat(*SITE, key_folders / "k" / "m1", "--zenoh-config", file, cwd=tmp_path).refuses(
+        reason
+    )
 
 
-def take(name: str, source: str) -> Change:
+def use_keys_of(name: str, source: str) -> Change:
     return lambda keys: (keys / "m1" / name).write_bytes(
         (keys.parent / source / name).read_bytes()
     )
 
 
-def say(**facts: object) -> Change:
+def change_facts(**facts: object) -> Change:
     def change(keys: Path) -> None:
         listed = json.loads((keys / "m1" / MEMBERS).read_text())
         (keys / "m1" / MEMBERS).write_text(json.dumps({**listed, **facts}))
@@ -209,15 +221,15 @@ SPOILT: list[tuple[Change, str]] = [
         lambda keys: (keys / "m1" / CERTIFICATE).write_text("secret"),
         "the keys are damaged, or were not made by `trilat keys new`",
     ),
-    (say(member="m2"), "the certificate is for m1, but members.json names m2"),
-    (say(members=["m2", "s"]), "members.json does not list m1"),
-    (say(members=["m1", "*"]), "a member's name must have 1 to 64 characters"),
-    (say(members=["m1", "m1"]), "each member once"),
-    (say(members=["m1", 7]), "a member's name must have 1 to 64 characters"),
-    (take(CERTIFICATE, "k/m2"), "the certificate is for m2, but members.json names m1"),
-    (take(PRIVATE_KEY, "k/m2"), "the private key and the certificate do not match"),
-    (take(AUTHORITY, "others/m1"), "the authority has not signed this certificate"),
-    (take(CERTIFICATE, "others/m1"), "the authority has not signed this certificate"),
+    (change_facts(member="m2"), "the certificate is for m1, but members.json names m2"),
+    (change_facts(members=["m2", "s"]), "members.json does not list m1"),
+    (change_facts(members=["m1", "*"]), "a member's name must have 1 to 64 characters"),
+    (change_facts(members=["m1", "m1"]), "each member once"),
+    (change_facts(members=["m1", 7]), "a member's name must have 1 to 64 characters"),
+    (use_keys_of(CERTIFICATE, "k/m2"), "the certificate is for m2, but members.json names m1"),
+    (use_keys_of(PRIVATE_KEY, "k/m2"), "the private key and the certificate do not match"),
+    (use_keys_of(AUTHORITY, "others/m1"), "the authority has not signed this certificate"),
+    (use_keys_of(CERTIFICATE, "others/m1"), "the authority has not signed this certificate"),
     (whole("old"), "the keys expired on"),
     (whole("early"), "the certificate is not valid before"),
 ]
@@ -226,7 +238,7 @@ SPOILT: list[tuple[Change, str]] = [
 @pytest.mark.parametrize(
     ("change", "reason"), SPOILT, ids=[reason[:40] for _, reason in SPOILT]
 )
-def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Path) -> None:
+def test_spoilt_keys_are_refused(change: Change, reason: str, keys: Path) -> None:
     read_member_keys(keys / "m1")
     change(keys)
     done = trilat(*SITE, keys / "m1", cwd=keys)
@@ -234,25 +246,27 @@ def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Pat
     assert "secret" not in done.err
 
 
-def test_the_keys_of_all_are_no_members(made: Path, tmp_path: Path) -> None:
-    trilat(*RECORD, made / "k", cwd=tmp_path).refuses(
+def test_the_folder_of_all_keys_is_no_member(key_folders: Path, tmp_path: Path) -> None:
+    trilat(*RECORD, key_folders / "k", cwd=tmp_path).refuses(
         "has the keys of all members; name the folder of one member"
     )
 
 
-def test_a_folder_shared_with_the_sticky_bit_will_do(keys: Path) -> None:
-    """As the volumes of containers are: sticky."""
+def test_folders_with_the_sticky_bit_are_accepted(keys: Path) -> None:
+    """The volumes of containers are such folders."""
     (keys / "m1").chmod(0o1777)
     assert read_member_keys(keys / "m1").member == "m1"
 
 
-def test_files_of_another_user_are_refused(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever may write the folder above puts a folder of his own there."""
-    own = (made / "k" / "m1" / MEMBERS).stat()
-    theirs = os.stat_result((own.st_mode, *own[1:4], 65533, *own[5:10]))
+def test_files_of_another_user_are_refused(
+    key_folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever may write the folder above could replace the folder of keys."""
+    owner = (key_folders / "k" / "m1" / MEMBERS).stat()
+    theirs = os.stat_result((owner.st_mode, *owner[1:4], 65533, *owner[5:10]))
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
     with pytest.raises(UsageError, match="belongs to another user, who can change the keys"):
-        member_keys._check_permissions(made / MEMBERS, theirs)
+        member_keys._check_permissions(key_folders / MEMBERS, theirs)
 
 
 NEW = [
@@ -272,11 +286,11 @@ NEW = [
 ]
 
 
-@pytest.mark.parametrize(("words", "reason"), NEW, ids=lambda value: str(value)[:40])
-def test_no_keys_are_made_for_many_and_nothing_is_left(
-    words: list[str], reason: str, tmp_path: Path
+@pytest.mark.parametrize(("arguments", "reason"), NEW, ids=lambda value: str(value)[:40])
+def test_invalid_requests_for_keys_leave_no_files(
+    arguments: list[str], reason: str, tmp_path: Path
 ) -> None:
-    trilat("keys", "new", "k", *words, cwd=tmp_path).refuses(reason)
+    trilat("keys", "new", "k", *arguments, cwd=tmp_path).refuses(reason)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -295,10 +309,10 @@ def test_python_makes_keys_for_so_many_days(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failing", range(1, 11))
-def test_keys_are_made_whole_or_not_at_all(
+def test_keys_are_complete_or_absent(
     failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk refuses the n-th file, or Ctrl-C comes there: what was made before goes too."""
+    """The disk refuses the n-th file, or Ctrl-C comes there: earlier files are removed too."""
     put, written = member_keys._write_new_file, list[Path]()
 
     def refuse(error: BaseException) -> Callable[[Path, bytes], None]:
@@ -338,11 +352,11 @@ def test_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
     assert read_member_keys(tmp_path / "k" / "m1").ends > datetime.now(UTC) + timedelta(days=29)
 
 
-def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
-    """By a process of its own, which listens over TLS where it would over TCP, and waits for the others."""
-    words = [*COMMAND, *SITE, str(made / "k" / "m1"), "--join-timeout", "0"]
+def test_valid_keys_are_accepted(key_folders: Path, tmp_path: Path) -> None:
+    """By a process of its own, which listens over TLS instead of TCP, and waits for the others."""
+    command = [*COMMAND, *SITE, str(key_folders / "k" / "m1"), "--join-timeout", "0"]
     done = subprocess.run(
-        words,
+        command,
         cwd=tmp_path,
         env={**PLAIN, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
@@ -353,11 +367,11 @@ def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
 
 
-def test_the_table_has_its_forty_rows() -> None:
+def test_the_table_has_forty_rows() -> None:
     assert sum(map(len, (OF_ANOTHER, FROM_PYTHON, ENDPOINTS, ZENOH_FILES, SPOILT, NEW))) >= 40
 
 
-def test_what_is_printed_of_keys_agrees_with_their_rules(tmp_path: Path) -> None:
+def test_printed_settings_agree_with_key_rules(tmp_path: Path) -> None:
     """A few lines for a person, the settings of Zenoh on request, and the same in JSON."""
     create_keys(tmp_path / "k", MEMBERS_MADE, ["192.0.2.7"])
     for member in MEMBERS_MADE:

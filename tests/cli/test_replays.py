@@ -1,4 +1,4 @@
-"""`trilat replay`: what it refuses before it takes part in anything."""
+"""`trilat replay`: refusals before the session is joined."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from .running import trilat
         (["--connect", "tcp/127.0.0.1:1", "--router", "tcp/127.0.0.1:2"], ["--router"]),
     ],
 )
-def test_what_cannot_be_meant_is_refused(
+def test_invalid_requests_are_refused(
     options: list[str], facts: list[str], log_file: Path
 ) -> None:
     trilat("replay", log_file.name, *options, cwd=log_file.parent).refuses(*facts)

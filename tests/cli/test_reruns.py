@@ -1,4 +1,4 @@
-"""`trilat rerun`: what it prints, writes, refuses, and how it ends."""
+"""`trilat rerun`: output, files, refusals and exit codes."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from trilat_net.log.log_reader import open_log
 from .running import trilat
 
 
-def test_nothing_changed_says_that_it_is_the_log(log_file: Path) -> None:
+def test_an_unchanged_rerun_equals_the_log(log_file: Path) -> None:
     text = trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent).succeeds()
     assert "open loop: s executed afresh; m1, m2 as recorded" in text
     assert "nothing is changed" in text
@@ -20,7 +20,7 @@ def test_nothing_changed_says_that_it_is_the_log(log_file: Path) -> None:
     assert "note" not in text
 
 
-def test_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> None:
+def test_changes_are_summarised_in_lines_that_fit(log_file: Path) -> None:
     done = trilat(
         "rerun", log_file, "--replace", "s", "--set", "control.Kd=5", cwd=log_file.parent
     )
@@ -37,7 +37,7 @@ def test_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> None
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_a_closed_loop_has_a_row_for_every_site(log_file: Path) -> None:
+def test_closed_loops_have_a_row_per_site(log_file: Path) -> None:
     options = ("--closed-loop", "--set", "link.delay_ms=300")
     text = trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds()
     assert "closed loop: m1, m2, s executed afresh\n" in text
@@ -53,7 +53,7 @@ def test_a_closed_loop_has_a_row_for_every_site(log_file: Path) -> None:
     assert "link m1->s: samples in use were 200 ms old" in text
 
 
-def test_the_outcome_is_a_log_that_every_command_reads(log_file: Path) -> None:
+def test_every_command_reads_the_resulting_log(log_file: Path) -> None:
     cwd = log_file.parent
     options = ("--replace", "s", "--set", "control.Kd=5", "-o", "again.mcap")
     assert "again.mcap" in trilat("rerun", log_file, *options, cwd=cwd).succeeds()
@@ -66,7 +66,7 @@ def test_the_outcome_is_a_log_that_every_command_reads(log_file: Path) -> None:
     trilat("log", "check", "again.mcap", cwd=cwd).succeeds()
 
 
-def test_json_says_all_of_it(log_file: Path) -> None:
+def test_json_has_all_results(log_file: Path) -> None:
     options = ("--replace", "s", "--set", "control.Kd=5", "--json", "-o", "again.mcap")
     facts = json.loads(trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds())
     assert facts["replaced"] == ["s"]
@@ -75,14 +75,14 @@ def test_json_says_all_of_it(log_file: Path) -> None:
     assert facts["sites"]["s"]["error_max_rad"]["before"] > 0.0
 
 
-def test_a_site_that_diverges_is_an_answer_and_a_failure(log_file: Path) -> None:
+def test_diverging_sites_are_a_result_and_failure(log_file: Path) -> None:
     options = ("--replace", "s", "--set", "limits.qd_limit_rad_s=0.5", "--set", "control.Kd=0")
     done = trilat("rerun", log_file, *options, cwd=log_file.parent)
     assert done.code == 1, done
     assert "s: diverged at 0." in done.out
 
 
-def test_log_that_is_not_what_it_says_is_failure(log_file: Path, short_log: bytes) -> None:
+def test_a_log_differing_from_its_records_fails(log_file: Path, short_log: bytes) -> None:
     def record(r: dict[str, object]) -> dict[str, object]:
         if (r["site"], r["tick"]) == ("s", 300):
             r["tau"] = [1.0, 2.0]
@@ -116,6 +116,6 @@ def test_bad_input_is_one_sentence(
     assert log_file.read_bytes() == before
 
 
-def test_a_log_of_a_version_to_come_is_bad_input(log_file: Path, short_log: bytes) -> None:
+def test_logs_of_later_versions_are_bad_input(log_file: Path, short_log: bytes) -> None:
     log_file.write_bytes(edited(short_log, record=lambda r: {**r, "v": 99}))
     trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent).refuses("version 99")

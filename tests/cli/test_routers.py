@@ -1,4 +1,4 @@
-"""Routers and Zenoh configurations of one's own, as options: bad input is one line and exit code 2."""
+"""Users' own routers and Zenoh configurations, as options: bad input gives one line and exit code 2."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def test_a_bad_configuration_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda words: words[0])
-def test_a_router_goes_alone(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_router_runs_alone(command: tuple[str, ...], tmp_path: Path) -> None:
     options = ("--router", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2")
     trilat(*command, *options, cwd=tmp_path).refuses("--router: ", "leave out --connect")
 
@@ -52,7 +52,7 @@ def test_a_router_on_a_busy_port_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
-def test_a_time_that_is_none_is_refused_by_its_name(seconds: str, tmp_path: Path) -> None:
+def test_an_invalid_time_is_refused_by_name(seconds: str, tmp_path: Path) -> None:
     trilat("router", "--until-idle", seconds, cwd=tmp_path).refuses(
         "--until-idle must be a number of seconds"
     )

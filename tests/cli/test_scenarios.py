@@ -16,15 +16,15 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 SHIPPED = {"paper", "paper_rods", "free", "asymmetric", "two_sites"}
 
 
-def test_list_names_every_shipped_scenario_in_80_columns(tmp_path: Path) -> None:
+def test_list_names_scenarios_within_80_columns(tmp_path: Path) -> None:
     lines = trilat("scenario", "list", cwd=tmp_path).succeeds().splitlines()
     assert {line.split()[0] for line in lines[1:]} == set(list_shipped()) >= SHIPPED
     assert max(map(len, lines)) <= 80
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_what_show_says_of_scenario_fits_terminal_of_80_columns(name: str) -> None:
-    """The same words as in its file: `show` prints them as they stand there."""
+def test_show_fits_scenarios_to_80_columns(name: str) -> None:
+    """The words are those of the file, printed unchanged."""
     scenario = load_scenario(name)
     assert f'about = """\n{scenario.about}"""' in scenario.text
     assert max(map(len, scenario.about.splitlines())) <= 80
@@ -32,13 +32,13 @@ def test_what_show_says_of_scenario_fits_terminal_of_80_columns(name: str) -> No
 
 
 @pytest.mark.parametrize("name", sorted(SHIPPED))
-def test_what_show_prints_is_the_same_scenario(name: str, tmp_path: Path) -> None:
+def test_shown_text_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     text = trilat("scenario", "show", name, cwd=tmp_path).succeeds()
     copy = tmp_path / "copy.toml"
     copy.write_text(text)
     assert load_scenario(copy).sha256 == load_scenario(name).sha256
-    said = trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
-    assert f"sha256 {load_scenario(name).sha256[:16]}" in said
+    output = trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
+    assert f"sha256 {load_scenario(name).sha256[:16]}" in output
 
 
 def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
     assert (tables["duration_s"], tables["seed"]) == (3.0, 9)
 
 
-def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
+def test_check_states_consequences_of_a_scenario(tmp_path: Path) -> None:
     text = trilat("scenario", "check", "asymmetric", cwd=tmp_path).succeeds()
     assert "weights of the sites in the proof of stability, sum 3 " in text
     assert ": m1 1.279, m2 0.4655, s 1.256" in text
@@ -71,7 +71,7 @@ def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
     assert "chosen here, not in the paper: " in text
 
 
-def test_new_writes_a_valid_template_and_keeps_existing_files(tmp_path: Path) -> None:
+def test_new_writes_a_template_and_keeps_files(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("precious")
     trilat("scenario", "new", path, cwd=tmp_path).refuses("mine.toml", "exists", "--force")
@@ -84,7 +84,7 @@ def test_new_writes_a_valid_template_and_keeps_existing_files(tmp_path: Path) ->
 @pytest.mark.parametrize(
     "options", [(), ("--set", "sites.s.arm.dead_man=true"), ("--set", "control.Kd=7")]
 )
-def test_refusal_of_a_real_arm_names_a_command_that_runs(
+def test_refused_real_arms_name_a_working_command(
     options: tuple[str, ...], tmp_path: Path
 ) -> None:
     shutil.copy(EXAMPLES / "two_operators.toml", tmp_path)
@@ -92,16 +92,16 @@ def test_refusal_of_a_real_arm_names_a_command_that_runs(
     sim = ("sim", "two_operators.toml", *wanted, *options)
     refused = trilat(*sim, cwd=tmp_path)
     assert refused.code == 2
-    words = shlex.split(refused.err.rpartition("run: trilat ")[2])
-    assert words[:2] == ["sim", "two_operators.toml"]
-    trilat(*words, cwd=tmp_path).succeeds()
-    settings = [word for word in words if "=" in word]
+    arguments = shlex.split(refused.err.rpartition("run: trilat ")[2])
+    assert arguments[:2] == ["sim", "two_operators.toml"]
+    trilat(*arguments, cwd=tmp_path).succeeds()
+    settings = [word for word in arguments if "=" in word]
     assert set(options[1:]) <= set(settings), "what was asked for stays"
     log = tn.open_log(tmp_path / "rehearsal.mcap")
     assert (log.scenario.seed, log.scenario.duration_s) == (3, 0.1)
 
 
-def test_other_commands_name_settings_that_work() -> None:
+def test_other_commands_name_working_settings() -> None:
     with pytest.raises(ScenarioError, match="only run live") as refused:
         tn.simulate(EXAMPLES / "two_operators.toml", duration_s=0.1)
     settings = re.findall(r"set (\S+=\S+)", str(refused.value))
@@ -113,8 +113,8 @@ def test_show_prints_the_scenario_of_a_log(tmp_path: Path) -> None:
     text = load_scenario("two_sites", {"duration_s": 0.2}).text
     (tmp_path / "own.toml").write_text(text, encoding="utf-8")
     trilat("sim", "./own.toml", "-o", "run.mcap", cwd=tmp_path).succeeds()
-    shown = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
-    assert shown.succeeds() == text
+    ended = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
+    assert ended.succeeds() == text
     changed = trilat("scenario", "show", "run.mcap", "--seed", "3", cwd=tmp_path)
     changed.refuses("printed as it is", "mine.toml")
     trilat("scenario", "show", "none.mcap", cwd=tmp_path).refuses("none.mcap")

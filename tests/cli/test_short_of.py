@@ -1,4 +1,6 @@
-"""Commands that get no disk, no memory, no help texts, or a signal as they compile: each says so plainly."""
+"""Commands without disk, memory or help texts, or interrupted while compiling: each reports the
+cause plainly.
+"""
 
 import os
 import random
@@ -22,10 +24,10 @@ WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE
 
 
 def limited(
-    kind: int, most: int, *words: str | Path, cwd: Path
+    kind: int, most: int, *arguments: str | Path, cwd: Path
 ) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
-        [*COMMAND, *map(str, words)],
+        [*COMMAND, *map(str, arguments)],
         cwd=cwd,
         env=WITHOUT_COMPILING,
         capture_output=True,
@@ -39,7 +41,7 @@ def limited(
 @pytest.mark.parametrize(
     "form", ["pdf", *(pytest.param(one, marks=pytest.mark.long) for one in ("svg", "png"))]
 )
-def test_figure_that_disk_refuses_is_named_and_not_there(form: str, tmp_path: Path) -> None:
+def test_figures_refused_by_disk_leave_no_file(form: str, tmp_path: Path) -> None:
     done = limited(
         resource.RLIMIT_FSIZE,
         1000,
@@ -59,7 +61,7 @@ def test_figure_that_disk_refuses_is_named_and_not_there(form: str, tmp_path: Pa
     assert list((tmp_path / "f").iterdir()) == []
 
 
-def test_keys_that_the_disk_refuses_are_named_and_not_there(tmp_path: Path) -> None:
+def test_keys_refused_by_disk_leave_no_file(tmp_path: Path) -> None:
     done = limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
     assert done.returncode == 5
     (line,) = done.stderr.splitlines()
@@ -68,13 +70,13 @@ def test_keys_that_the_disk_refuses_are_named_and_not_there(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("mib", "words"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))]
+    ("mib", "arguments"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))]
 )
-def test_too_little_memory_is_said_in_one_line(
-    mib: int, words: Sequence[str], tmp_path: Path
+def test_too_little_memory_is_one_line(
+    mib: int, arguments: Sequence[str], tmp_path: Path
 ) -> None:
-    """As `ulimit -v` leaves it, where libraries cannot be loaded, or try for ever."""
-    done = limited(resource.RLIMIT_AS, mib << 20, *words, LOG, cwd=tmp_path)
+    """With `ulimit -v` libraries cannot be loaded, or retry for ever."""
+    done = limited(resource.RLIMIT_AS, mib << 20, *arguments, LOG, cwd=tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "error: there is too little memory" in done.stderr
@@ -99,8 +101,8 @@ def test_without_docstrings_commands_work_but_have_no_help(tmp_path: Path) -> No
         assert said in done.stdout
 
 
-def test_recovering_blames_the_file_that_cannot_be_written(tmp_path: Path) -> None:
-    """What an earlier recovery left there, which cannot be removed; the source can be read."""
+def test_recovering_blames_the_unwritable_file(tmp_path: Path) -> None:
+    """An earlier recovery left a file there that cannot be removed; the source can be read."""
     (tmp_path / "run.mcap.active").write_bytes(LOG.read_bytes())
     (tmp_path / "run.mcap.recovering").mkdir()
     trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses(
@@ -109,7 +111,7 @@ def test_recovering_blames_the_file_that_cannot_be_written(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ("scenario", "check"),
         ("trace", "import", "irtt"),
@@ -121,10 +123,10 @@ def test_recovering_blames_the_file_that_cannot_be_written(tmp_path: Path) -> No
     ],
     ids=" ".join,
 )
-def test_what_a_foreign_file_says_is_not_repeated(
-    words: tuple[str, ...], tmp_path: Path
+def test_contents_of_foreign_files_are_not_repeated(
+    arguments: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """It may be one that whoever reads the error may not read."""
+    """The reader of the error may not be allowed to read that file."""
     for text in (
         "root:secret:19000:0\n",
         "secret, words\n1, 2\n",
@@ -132,8 +134,8 @@ def test_what_a_foreign_file_says_is_not_repeated(
         "t_s,delay_ms\nsecret,1\n",
     ):
         (tmp_path / "foreign").write_text(text)
-        more = ("-o", "made.csv") if words[0] == "trace" else ()
-        done = trilat(*words, "foreign", *more, cwd=tmp_path)
+        more = ("-o", "made.csv") if arguments[0] == "trace" else ()
+        done = trilat(*arguments, "foreign", *more, cwd=tmp_path)
         assert done.code == 2, done
         assert "foreign" in done.err
         assert "secret" not in done.err + done.out
@@ -143,15 +145,15 @@ def test_what_a_foreign_file_says_is_not_repeated(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
 )
 @pytest.mark.parametrize(
-    "words", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
+    "arguments", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
 )
-def test_cold_start_says_that_it_compiles_and_ends_at_once(
-    words: tuple[str, ...], number: signal.Signals, tmp_path: Path
+def test_cold_starts_say_they_compile_and_stop(
+    arguments: tuple[str, ...], number: signal.Signals, tmp_path: Path
 ) -> None:
-    """Python takes a signal between two instructions, and one call of the compiler takes minutes."""
+    """Python handles a signal between two instructions, and one call of the compiler takes minutes."""
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     started = subprocess.Popen(
-        [*COMMAND, *words], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True
+        [*COMMAND, *arguments], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True
     )
     assert started.stderr is not None
     try:
@@ -183,18 +185,18 @@ main()
 @pytest.mark.parametrize(
     "seed", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in range(2, 16))]
 )
-def test_a_signal_ends_a_cold_start_in_every_phase(seed: int, tmp_path: Path) -> None:
-    """As it is imported, read, compiled or kept: whatever Python makes of the signal there."""
+def test_signals_end_cold_starts_in_every_phase(seed: int, tmp_path: Path) -> None:
+    """While importing, reading, compiling or caching, whatever Python makes of the signal there."""
     draw = random.Random(seed)
     number, instant_s = draw.choice(ENDING_SIGNALS), draw.uniform(0.2, 8.0)
-    words = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
+    arguments = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
     command = [
         sys.executable,
         "-c",
         AT_AN_INSTANT,
         f"{instant_s:.3f}",
         str(int(number)),
-        *words,
+        *arguments,
     ]
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(
@@ -203,8 +205,8 @@ def test_a_signal_ends_a_cold_start_in_every_phase(seed: int, tmp_path: Path) ->
     assert done.returncode in (-number, 128 + number), done.stderr
 
 
-def test_a_signal_ends_a_containers_first_process_while_it_compiles(tmp_path: Path) -> None:
-    """The kernel lets no signal end such a process that it did not ask for."""
+def test_signals_end_a_containers_compiling_process(tmp_path: Path) -> None:
+    """The kernel delivers no signal to such a process unless the process has a handler for it."""
     first = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--kill-child"]
     if (
         shutil.which("unshare") is None
@@ -220,7 +222,7 @@ def test_a_signal_ends_a_containers_first_process_while_it_compiles(tmp_path: Pa
     assert done.returncode == 128 + number
 
 
-def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:
+def test_signals_kill_compiling_only_where_safe() -> None:
     # as under nohup
     ours = [name for name in ENDING_SIGNALS if signal.getsignal(name) is not signal.SIG_IGN]
 
@@ -245,7 +247,7 @@ def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:
         assert released()
 
 
-def test_signal_that_broke_off_inner_part_is_that_of_whole() -> None:
+def test_signal_in_inner_part_sets_outer_exit_code() -> None:
     with Interrupt() as outer:
         with pytest.raises(KeyboardInterrupt), Interrupt() as inner, inner.raising():
             os.kill(os.getpid(), signal.SIGTERM)

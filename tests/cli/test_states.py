@@ -1,4 +1,4 @@
-"""The table docs/data/log-states.csv: the state of a log, a command, and what is said."""
+"""The table docs/data/log-states.csv: the state of a log, a command, and its message."""
 
 import csv
 from collections.abc import Callable, Iterator
@@ -35,7 +35,7 @@ def torn() -> bytes:
 
 
 def sparse() -> bytes:
-    """What an older recorder wrote that missed every tenth record of m1, and says so."""
+    """Returns a log of an older recorder that missed every tenth record of m1, and says so."""
     taken = taken_apart(whole()).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
     taken.messages = [
@@ -51,7 +51,7 @@ def sparse() -> bytes:
 
 
 def spliced() -> bytes:
-    """Two runs over a gap, under the starts of the first."""
+    """Returns two runs over a gap, under the starts of the first."""
     first = taken_apart(whole()).without_chain()
     other = taken_apart(recorded("free", {**RUN, "control.Kd": 3.5}))
     topics = first.topics()
@@ -69,7 +69,9 @@ def older() -> bytes:
 
 
 def forged() -> bytes:
-    """The torque of m1 and m2 is zeroed, and the metadata claim that only s was executed."""
+    """Returns a log in which the torque of m1 and m2 is zeroed, and the metadata claim that
+    only s was executed.
+    """
     claims = {"driver": "rerun", "rerun_executed": "s"}
     zeroed = {"tau": [0.0, 0.0]}
     return edited(
@@ -78,9 +80,9 @@ def forged() -> bytes:
 
 
 def changed() -> bytes:
-    taken = taken_apart(whole())
-    taken.metadata("trilat.session")["commit"] = "0" * 40
-    return taken.bytes()
+    pieces = taken_apart(whole())
+    pieces.metadata("trilat.session")["commit"] = "0" * 40
+    return pieces.bytes()
 
 
 def newer() -> bytes:
@@ -94,7 +96,7 @@ MADE: dict[str, Callable[[], bytes]] = {
 
 
 def table_cells() -> Iterator[Any]:
-    """Every cell; on a push some states are passed over, and of a torn log alone a report is made."""
+    """Yields every cell; on a push some states are skipped, and only a torn log gets a report."""
     for state, command in product([*MADE, "part"], COMMANDS):
         slow = state in ("older", "changed", "part") or (
             command == "report" and state != "torn"
@@ -103,7 +105,7 @@ def table_cells() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("state", "command"), list(table_cells()))
-def test_the_table_says_what_is_said(state: str, command: str, tmp_path: Path) -> None:
+def test_the_table_has_the_printed_messages(state: str, command: str, tmp_path: Path) -> None:
     code, _, text = ROWS[state][command].partition(": ")
     file = tmp_path / "run.mcap"
     if state == "part":
@@ -120,13 +122,13 @@ def test_the_table_has_every_state() -> None:
 
 
 @pytest.mark.long
-def test_a_report_asks_for_the_coverage_that_it_is_told(
+def test_reports_use_the_requested_coverage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nine tenths of the records of m1 are there: enough where half is asked for."""
+    """Nine tenths of the records of m1 exist: enough if half is requested."""
     monkeypatch.setattr(page, "write_report", lambda *_, verdicts, **__: [*verdicts][:0])
     file = tmp_path / "run.mcap"
     file.write_bytes(MADE["sparse"]())
-    found = conclude(open_log(file), tmp_path, min_coverage=0.5)
-    assert {line.check: line.passed for line in found.findings}["records"]
-    assert not any("less than 99.9 %" in note for note in found.notes)
+    conclusion = conclude(open_log(file), tmp_path, min_coverage=0.5)
+    assert {line.check: line.passed for line in conclusion.findings}["records"]
+    assert not any("less than 99.9 %" in note for note in conclusion.notes)

@@ -1,4 +1,4 @@
-"""What a user meant instead: commands by their synonyms, and keys by the table that has them."""
+"""Suggestions for mistaken input: commands for their synonyms, and keys with their table."""
 
 import re
 import shutil
@@ -21,7 +21,7 @@ def in_one_line(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("words", "suggestion"),
+    ("arguments", "suggestion"),
     [
         (["simulate", "paper"], "trilat sim?"),
         (["run"], "trilat sim or trilat demo?"),
@@ -35,14 +35,14 @@ def in_one_line(text: str) -> str:
     ],
 )
 def test_an_unknown_command_suggests_one(
-    words: list[str], suggestion: str, tmp_path: Path
+    arguments: list[str], suggestion: str, tmp_path: Path
 ) -> None:
-    done = trilat(*words, cwd=tmp_path)
+    done = trilat(*arguments, cwd=tmp_path)
     assert done.code == 2
     assert f"did you mean {suggestion}" in in_one_line(done.err)
 
 
-def test_subjects_without_command_lead_to_existing_pages(tmp_path: Path) -> None:
+def test_subjects_without_command_lead_to_pages(tmp_path: Path) -> None:
     text = in_one_line(trilat("lerobot", cwd=tmp_path).err)
     assert "trilat log export FILE --to lerobot" in text
     commands = whole_command().commands
@@ -53,7 +53,7 @@ def test_subjects_without_command_lead_to_existing_pages(tmp_path: Path) -> None
         assert all((ROOT / page).is_file() for page in pages)
 
 
-def test_a_word_like_no_command_lists_all(tmp_path: Path) -> None:
+def test_an_unrelated_word_lists_all_commands(tmp_path: Path) -> None:
     text = in_one_line(trilat("log", "zzzzzz", cwd=tmp_path).err)
     assert "trilat log has the commands info" in text
 
@@ -107,7 +107,7 @@ def test_an_unknown_key_suggests_the_whole_path(
     ],
 )
 @pytest.mark.parametrize("command", ["sim", "linear"])
-def test_a_setting_that_the_shell_splits_is_to_be_quoted(
+def test_a_setting_split_by_the_shell_needs_quotes(
     setting: str, command: str, tmp_path: Path
 ) -> None:
     bash = shutil.which("bash")
@@ -115,16 +115,16 @@ def test_a_setting_that_the_shell_splits_is_to_be_quoted(
         pytest.skip("needs a shell that expands braces")
     line = f"printf '%s\\n' --set {setting}"
     shell = subprocess.run([bash, "-c", line], capture_output=True, text=True, check=True)
-    words = shell.stdout.splitlines()
-    assert len(words) > 2
-    assert find_split_setting(words) == setting
-    said = in_one_line(trilat(command, "paper", *words, cwd=tmp_path).err)
+    arguments = shell.stdout.splitlines()
+    assert len(arguments) > 2
+    assert find_split_setting(arguments) == setting
+    said = in_one_line(trilat(command, "paper", *arguments, cwd=tmp_path).err)
     assert "put it into quotes" in said
     assert find_split_setting(["--set", setting, "--force"]) == ""
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ["--set", "control.Kd=5", "--set", "control.Kp=1"],
         ["--set", "control.Kd=[3, 4]", "free"],
@@ -133,16 +133,16 @@ def test_a_setting_that_the_shell_splits_is_to_be_quoted(
         ["--set", "no form"],
     ],
 )
-def test_whole_settings_are_left_alone(words: list[str]) -> None:
-    assert find_split_setting(words) == ""
+def test_whole_settings_stay_unchanged(arguments: list[str]) -> None:
+    assert find_split_setting(arguments) == ""
 
 
 def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:
-    words = ["--set", "control.law=p_d", "--set", "control.D=1"]
-    trilat("scenario", "check", "paper", *words, cwd=tmp_path).refuses("did you mean 'd'?")
+    arguments = ["--set", "control.law=p_d", "--set", "control.D=1"]
+    trilat("scenario", "check", "paper", *arguments, cwd=tmp_path).refuses("did you mean 'd'?")
 
 
-def test_a_faint_similarity_elsewhere_suggests_nothing() -> None:
+def test_faint_similarity_suggests_nothing() -> None:
     assert suggest_nearest("foo", ["name", "seed"], ["control.follows"]) == ""
     assert find_nearest("x" * 81, ["x" * 81]) == ""
 
@@ -158,18 +158,16 @@ class Torques:
 
 
 @pytest.mark.parametrize("written", ["torques.py", "torques"])
-def test_a_file_in_place_of_a_law_is_answered_with_its_class(
-    written: str, tmp_path: Path
-) -> None:
+def test_a_file_as_law_suggests_its_class(written: str, tmp_path: Path) -> None:
     (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
-    words = ("sim", "two_sites", "--set", f"control.law={written}")
-    trilat(*words, cwd=tmp_path).refuses("write torques:Torques")
+    arguments = ("sim", "two_sites", "--set", f"control.law={written}")
+    trilat(*arguments, cwd=tmp_path).refuses("write torques:Torques")
 
 
 def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
-    words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
-    said = trilat(*words, "--duration", "0.1", cwd=tmp_path).err
+    arguments = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
+    said = trilat(*arguments, "--duration", "0.1", cwd=tmp_path).err
     line = (
         SUM_OF_NOTHING.splitlines().index("        return [sum_of_nothing for _ in now.q]") + 1
     )
@@ -179,8 +177,8 @@ def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:
 def test_the_next_command_permits_the_law_that_ran(tmp_path: Path) -> None:
     text = SUM_OF_NOTHING.replace("sum_of_nothing", "0.0")
     (tmp_path / "torques.py").write_text(text, "utf-8")
-    words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
-    printed = trilat(*words, "--duration", "0.1", cwd=tmp_path).succeeds()
-    (law,) = re.findall(r"next: trilat report run\.mcap --law (\S+)", printed)
+    arguments = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
+    output = trilat(*arguments, "--duration", "0.1", cwd=tmp_path).succeeds()
+    (law,) = re.findall(r"next: trilat report run\.mcap --law (\S+)", output)
     judged = trilat("verify", "run.mcap", "--law", law, cwd=tmp_path).out
     assert "200/200 records identical" in judged

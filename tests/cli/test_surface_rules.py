@@ -1,4 +1,4 @@
-"""What holds for every command: results as JSON, outputs by one option, completion, a version."""
+"""Rules for every command: results as JSON, outputs by one option, completion, a version."""
 
 import json
 import subprocess
@@ -35,14 +35,14 @@ NO_RESULT = {
 """Commands that print what they do, and find nothing."""
 
 
-def test_every_command_that_finds_something_prints_it_as_json() -> None:
+def test_every_command_with_results_prints_json() -> None:
     assert {name for name in COMMANDS if "--json" not in OPTIONS[name]} == NO_RESULT
 
 
-def test_every_output_is_named_alike() -> None:
+def test_outputs_have_one_option_name() -> None:
     for name, names in OPTIONS.items():
-        given = {"-o", "--out", "--output"} & set(names)
-        assert not given or given >= {"-o", "--out"}, name
+        output_options = {"-o", "--out", "--output"} & set(names)
+        assert not output_options or output_options >= {"-o", "--out"}, name
 
 
 def test_the_version_is_that_of_the_package() -> None:
@@ -51,7 +51,7 @@ def test_the_version_is_that_of_the_package() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "found"),
+    ("phrase", "found"),
     [
         ("sim tw", {"two_sites"}),
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
@@ -63,12 +63,15 @@ def test_the_version_is_that_of_the_package() -> None:
         pytest.param(f"twin {GOLDEN_LOG} --push m", {"m1", "m2"}, marks=pytest.mark.long),
     ],
 )
-def test_a_shell_completes(words: str, found: set[str]) -> None:
-    asked = {"_TRILAT_COMPLETE": "complete_fish", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+def test_shells_complete_commands(phrase: str, found: set[str]) -> None:
+    environment = {
+        "_TRILAT_COMPLETE": "complete_fish",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
     code = "from trilat_net.app.cli import app; app(prog_name='trilat')"
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={**PLAIN, **asked, "_TYPER_COMPLETE_ARGS": f"trilat {words}"},
+        env={**PLAIN, **environment, "_TYPER_COMPLETE_ARGS": f"trilat {phrase}"},
         capture_output=True,
         text=True,
     )
@@ -76,28 +79,30 @@ def test_a_shell_completes(words: str, found: set[str]) -> None:
 
 
 @pytest.mark.long
-def test_what_was_made_is_named_as_json(tmp_path: Path) -> None:
-    made = json.loads(
+def test_created_files_are_named_in_json(tmp_path: Path) -> None:
+    facts = json.loads(
         trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds()
     )
-    assert made["files"] == ["two_sites.mcap"]
-    assert made["sites"]["m"]["records"] == 100
-    asked = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
-    assert json.loads(trilat(*asked, cwd=tmp_path).succeeds())["records"] == {
+    assert facts["files"] == ["two_sites.mcap"]
+    assert facts["sites"]["m"]["records"] == 100
+    command = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
+    assert json.loads(trilat(*command, cwd=tmp_path).succeeds())["records"] == {
         "m": 100,
         "s": 100,
     }
     shipped = json.loads(trilat("scenario", "list", "--json", cwd=tmp_path).succeeds())
-    assert {"free", "paper"} < {one["name"] for one in shipped}
-    told = json.loads(trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds())
-    assert told["sha256"] == tn.load_scenario("paper").sha256
+    assert {"free", "paper"} < {scenario["name"] for scenario in shipped}
+    check_facts = json.loads(
+        trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds()
+    )
+    assert check_facts["sha256"] == tn.load_scenario("paper").sha256
     ran = json.loads(trilat("test", "free", "--jobs", "1", "--json", cwd=tmp_path).out)
     assert ran["held"]
     assert [run["seed"] for run in ran["runs"]] == [1]
 
 
 @pytest.mark.long
-def test_a_sweep_is_json_while_its_lines_go_aside(tmp_path: Path) -> None:
+def test_a_sweeps_json_keeps_progress_lines_aside(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.3,3", "--duration", "2", "--jobs", "1", "-o", "grid")
     first = trilat("sweep", "p_d_margin", *over, "--json", cwd=tmp_path)
     again = trilat("sweep", "grid", "--json", cwd=tmp_path)

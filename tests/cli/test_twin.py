@@ -24,8 +24,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
-    asked = (
+def test_pushes_are_described_and_drawn(folder: Path) -> None:
+    arguments = (
         "twin",
         "run.mcap",
         "--at",
@@ -37,30 +37,30 @@ def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
         "-o",
         "twin.png",
     )
-    words = trilat(*asked, cwd=folder).succeeds().splitlines()
-    assert words[0].startswith("a push of 1e-06 rad at m joint 1 at 1 s becomes ")
-    assert words[1].startswith("a push of 1e-06 rad/s at s joint 2 at 1 s becomes ")
-    assert words[2].strip() == "twin.png"
+    lines = trilat(*arguments, cwd=folder).succeeds().splitlines()
+    assert lines[0].startswith("a push of 1e-06 rad at m joint 1 at 1 s becomes ")
+    assert lines[1].startswith("a push of 1e-06 rad/s at s joint 2 at 1 s becomes ")
+    assert lines[2].strip() == "twin.png"
     first = (folder / "twin.png").read_bytes()
     assert first.startswith(b"\x89PNG")
-    trilat(*asked, cwd=folder).refuses("twin.png", "--force")
-    trilat(*asked, "--force", cwd=folder).succeeds()
+    trilat(*arguments, cwd=folder).refuses("twin.png", "--force")
+    trilat(*arguments, "--force", cwd=folder).succeeds()
     assert (folder / "twin.png").read_bytes() == first
 
 
-def test_one_joint_is_pushed_by_two_sizes(folder: Path) -> None:
-    asked = ("twin", "run.mcap", "--push", "m.q1=1e-6", "--push", "m.q1=-1e-3")
-    words = trilat(*asked, cwd=folder).succeeds().splitlines()
-    assert [line.split()[3] for line in words] == ["1e-06", "-0.001"]
+def test_two_sizes_push_one_joint(folder: Path) -> None:
+    arguments = ("twin", "run.mcap", "--push", "m.q1=1e-6", "--push", "m.q1=-1e-3")
+    lines = trilat(*arguments, cwd=folder).succeeds().splitlines()
+    assert [line.split()[3] for line in lines] == ["1e-06", "-0.001"]
 
 
-def test_sizes_are_told_apart_from_what_is_linear(folder: Path) -> None:
-    found = json.loads(
+def test_sizes_are_separated_from_linear_growth(folder: Path) -> None:
+    facts = json.loads(
         trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds()
     )
-    assert found["linear"]["smallest"] == 1e-9
-    assert found["linear"]["text"].startswith("linear from 1e-09 to 0.001 rad at all joints")
-    assert [one["push"].split()[0] for one in found["pushes"]] == [
+    assert facts["linear"]["smallest"] == 1e-9
+    assert facts["linear"]["text"].startswith("linear from 1e-09 to 0.001 rad at all joints")
+    assert [push["push"].split()[0] for push in facts["pushes"]] == [
         f"{10.0**n:g}" for n in range(-9, -2)
     ]
 
@@ -95,13 +95,13 @@ def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
     trilat("twin", "run.mcap", other, cwd=folder).refuses("not a part of the session")
 
 
-def test_a_law_that_may_not_run_has_no_twin(folder: Path) -> None:
+def test_a_forbidden_law_has_no_twin(folder: Path) -> None:
     done = trilat("twin", OWN_LAW, cwd=folder)
     assert done.code == 4
     assert done.err.splitlines()[-1].startswith("error: ")
 
 
-def test_what_cannot_be_executed_again_has_no_twin() -> None:
+def test_unexecutable_logs_have_no_twin() -> None:
     lost, log = without_records({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
     with pytest.raises(NotRepeatable, match="records of m1 are missing"):
         tn.twin(lost)
@@ -116,7 +116,7 @@ def test_what_cannot_be_executed_again_has_no_twin() -> None:
 
 
 @pytest.mark.parametrize("command", ["certify", "twin"])
-def test_help_tells_of_twins(command: str, folder: Path) -> None:
+def test_help_mentions_twins(command: str, folder: Path) -> None:
     assert "twin" in trilat(command, "--help", cwd=folder).succeeds()
 
 

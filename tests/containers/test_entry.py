@@ -1,4 +1,4 @@
-"""The first program of a container: who owns the results, and what it does where it may not."""
+"""The first program of a container: the owner of the results, and refusals where it may not write."""
 
 import os
 import runpy
@@ -38,28 +38,26 @@ def owner(path: Path) -> object:
 
 
 @needs_root
-def test_the_results_go_to_the_owner_of_the_mark(mark: Path) -> None:
+def test_results_go_to_the_marks_owner(mark: Path) -> None:
     os.chown(mark, *SOMEBODY)
     assert entry.find_results_owner(mark) == SOMEBODY
 
 
 @needs_root
-def test_the_command_never_runs_as_root_of_the_host(mark: Path, tmp_path: Path) -> None:
+def test_commands_never_run_as_the_hosts_root(mark: Path, tmp_path: Path) -> None:
     nowhere = user_map(tmp_path, "         0          0 4294967295\n")
     assert entry.find_results_owner(mark, nowhere) == Owner(entry.SERVANT, entry.SERVANT)
 
 
 @needs_root
-def test_root_of_rootless_engine_is_person_who_started_it(mark: Path, tmp_path: Path) -> None:
+def test_root_in_rootless_engine_is_the_starter(mark: Path, tmp_path: Path) -> None:
     rootless = user_map(tmp_path, "0 1000 1\n1 100000 65536\n")
     assert entry.find_results_owner(mark, rootless) == Owner(0, 0)
 
 
 @needs_root
 @pytest.mark.parametrize("exists", [False, True])
-def test_what_the_engine_made_is_given_with_the_folder_above(
-    tmp_path: Path, exists: bool
-) -> None:
+def test_folders_made_by_the_engine_are_given_away(tmp_path: Path, exists: bool) -> None:
     results = tmp_path / "runs" / "compose"
     results.parent.mkdir()
     if exists:
@@ -70,7 +68,7 @@ def test_what_the_engine_made_is_given_with_the_folder_above(
 
 
 @needs_root
-def test_roots_own_folder_above_stays_roots(tmp_path: Path) -> None:
+def test_root_keeps_its_own_folder(tmp_path: Path) -> None:
     results = tmp_path / "runs" / "compose"
     results.parent.mkdir()
     entry.give_folder(results, Owner(entry.SERVANT, entry.SERVANT))
@@ -79,8 +77,8 @@ def test_roots_own_folder_above_stays_roots(tmp_path: Path) -> None:
 
 
 @needs_root
-def test_nobody_is_deprived(tmp_path: Path) -> None:
-    """Neither of a folder nor of what lies in one; and a link is given, not what it leads to."""
+def test_nobody_loses_ownership(tmp_path: Path) -> None:
+    """Neither of a folder nor of its contents; and a link itself is given, not its target."""
     theirs, results = tmp_path / "theirs", tmp_path / "runs" / "compose"
     results.mkdir(parents=True)
     secret, link, kept = tmp_path / "secret", results / "link", results / "kept"
@@ -97,7 +95,7 @@ def test_nobody_is_deprived(tmp_path: Path) -> None:
     assert (owner(theirs), owner(theirs / "kept")) == (Owner(99, 99), Owner(0, 0))
 
 
-def test_who_may_not_write_is_told_who_and_where(
+def test_an_unwritable_folder_is_named_with_owner(
     tmp_path: Path,
     mark: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -115,7 +113,7 @@ def test_who_may_not_write_is_told_who_and_where(
     assert len(said.splitlines()) == 1
 
 
-def test_a_mark_that_is_not_there_is_told(
+def test_a_missing_mark_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 0)
@@ -124,7 +122,7 @@ def test_a_mark_that_is_not_there_is_told(
     assert "No such file" in capsys.readouterr().err
 
 
-def test_cache_is_copied_and_missing_one_is_no_failure(tmp_path: Path) -> None:
+def test_missing_caches_fail_nothing_and_others_copy(tmp_path: Path) -> None:
     held, own = tmp_path / "held", tmp_path / "own"
     entry.copy_cache(held, own)
     assert not own.exists()
@@ -135,7 +133,7 @@ def test_cache_is_copied_and_missing_one_is_no_failure(tmp_path: Path) -> None:
         assert (own / "deep" / "code").read_bytes() == b"compiled"
 
 
-def test_it_becomes_the_command(
+def test_the_entry_becomes_the_command(
     tmp_path: Path, mark: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     became: list[Sequence[str]] = []
@@ -165,16 +163,16 @@ for name in {*members, "authority"}:
 
 @pytest.fixture
 def volumes() -> Iterator[Path]:
-    """The members' volumes, where any user may look: that of the program, too."""
+    """The members' volumes, which any user may read, and the program's volume."""
     with tempfile.TemporaryDirectory() as name:
-        place = Path(name)
-        place.chmod(0o755)
+        volume_folder = Path(name)
+        volume_folder.chmod(0o755)
         for folder in ("keys/recorder", "keys/m1", "keys/s", "scratch"):
-            (place / folder).mkdir(parents=True)
-            (place / folder).chmod(0o1777)
-        (place / "program").write_text(PROGRAM)
-        (place / "program").chmod(0o755)
-        yield place / "keys"
+            (volume_folder / folder).mkdir(parents=True)
+            (volume_folder / folder).chmod(0o1777)
+        (volume_folder / "program").write_text(PROGRAM)
+        (volume_folder / "program").chmod(0o755)
+        yield volume_folder / "keys"
 
 
 def hand_out(volumes: Path, user: Any) -> None:
@@ -184,7 +182,7 @@ def hand_out(volumes: Path, user: Any) -> None:
 
 
 @needs_root
-def test_every_member_gets_its_own_keys_and_authority_is_gone(volumes: Path) -> None:
+def test_members_get_own_keys_and_authority_disappears(volumes: Path) -> None:
     hand_out(volumes, SOMEBODY)
     for name, whose in (("recorder", SOMEBODY), ("m1", Owner(entry.SITES, entry.SITES))):
         for file in ("members.json", "private.key"):
@@ -198,7 +196,7 @@ def test_every_member_gets_its_own_keys_and_authority_is_gone(volumes: Path) -> 
 
 
 @needs_root
-def test_keys_that_hold_are_kept_and_old_ones_made_anew(volumes: Path) -> None:
+def test_valid_keys_are_kept_and_expired_ones_replaced(volumes: Path) -> None:
     def made_by(user: int) -> set[str]:
         hand_out(volumes, Owner(user, user))
         return {

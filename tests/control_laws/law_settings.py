@@ -1,4 +1,4 @@
-"""Per built-in law that is plugged in a shipped scenario, and settings with which it runs."""
+"""A shipped scenario and working settings for each built-in law that is plugged in."""
 
 from typing import Any
 

@@ -1,4 +1,6 @@
-"""`adaptive_kinematics`: of known lengths the law of task space; of unknown ones V falls, and arms meet."""
+"""`adaptive_kinematics`: with known lengths the law of task space; with unknown ones V falls,
+and arms meet.
+"""
 
 import numpy as np
 import pytest
@@ -76,7 +78,7 @@ def places(log: Log, site: str) -> np.ndarray:
 
 
 @pytest.mark.long
-def test_of_known_lengths_it_is_the_law_of_task_space() -> None:
+def test_known_lengths_give_the_task_space_law() -> None:
     pushed = {"Gamma": 0.0, "gravity": 0.0, "elbow_rad": 1.5, "hands": PUSH, "duration_s": 3.0}
     own, chain = run(UNKNOWN, **pushed), run(KNOWN, **pushed)
     for site in own.sites:
@@ -104,26 +106,28 @@ DELAY = 60  # ticks
 
 
 def functional(log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """V and the integral of sum_i (r'Kp r + 1/2 |xd_i - xd_j(t - T)|^2), from the second tick with samples.
+    """Returns V and the integral of sum_i (r'Kp r + 1/2 |xd_i - xd_j(t - T)|^2), from the
+    second tick with samples.
 
-    V = 1/2 sum_i (r'M r + theta~^2 / Gamma + l~^2 / Gamma_l + e'Lambda Kd e + int over T of xd_j'Kd xd_j)
+    V = 1/2 sum_i (r'M r + theta~^2 / Gamma + l~^2 / Gamma_l + e'Lambda Kd e + int over T of
+    xd_j'Kd xd_j).
     """
     Lambda, Kp, Kd = 1.5, np.array([6.0, 4.0]), np.array([8.0, 5.0])
     V, lost = np.zeros(len(log["m"]) - DELAY), np.zeros(len(log["m"]) - DELAY)
     for site, peer in (("m", "s"), ("s", "m")):
-        here, arm = log[site], log.scenario.arms[site]
-        lengths_m = np.array([state.mem[-4:-2] for state in here.states])[DELAY:]
-        q = here.q[DELAY:]
+        records, arm = log[site], log.scenario.arms[site]
+        lengths_m = np.array([state.mem[-4:-2] for state in records.states])[DELAY:]
+        q = records.q[DELAY:]
         e = places(log, site)[DELAY:] - places(log, peer)[:-DELAY]
         r = (
-            here.qd[DELAY:]
+            records.qd[DELAY:]
             + np.linalg.solve(jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
         )
         speed = speeds(log, peer)
         stored = integral((Kd * speed**2).sum(axis=1))
         V += 0.5 * (
             (r * PlanarArmRows(arm.theta, 0.0, (1.0, 1.0)).multiply_inertia(q, r)).sum(axis=1)
-            + ((here.theta_hat[DELAY:] - arm.theta) ** 2).sum(axis=1)
+            + ((records.theta_hat[DELAY:] - arm.theta) ** 2).sum(axis=1)
             + ((lengths_m - arm.lengths_m) ** 2).sum(axis=1) / LENGTH_GAIN
             + Lambda * (Kd * e**2).sum(axis=1)
             + (stored[DELAY:] - stored[:-DELAY])
@@ -138,7 +142,7 @@ WRONG = {"Gamma": 1.0, "first_m": 0.7, "second_m": 1.4, "slave_m": 1.2, "duratio
 
 
 @pytest.mark.long
-def test_with_unknown_lengths_v_falls_by_the_dissipation() -> None:
+def test_with_unknown_lengths_v_falls_by_dissipation() -> None:
     log = run(UNKNOWN, gain=LENGTH_GAIN, **WRONG)
     V, lost = functional(log)
     assert np.abs(V + lost - V[0]).max() <= 1e-5 * V[0]
@@ -148,27 +152,29 @@ def test_with_unknown_lengths_v_falls_by_the_dissipation() -> None:
 
 
 @pytest.mark.long
-def test_without_learning_lengths_v_falls_by_something_else() -> None:
+def test_without_learning_lengths_v_changes_otherwise() -> None:
     V, lost = functional(run(UNKNOWN, gain=0.0, **WRONG))
     assert np.abs(V + lost - V[0]).max() > 1e-3 * V[0]
 
 
 def estimated_over_true(lengths: tuple[float, float], q: tuple[float, float]) -> np.ndarray:
-    """J_hat J^-1 of an arm of two links of 1 m, which relates estimated to true velocities."""
+    """Returns J_hat J^-1 of an arm of two links of 1 m, which relates estimated to true velocities."""
     pose = np.array([q])
     estimated = jacobians(np.array([lengths]), pose)[0]
     true = jacobians(np.array([[1.0, 1.0]]), pose)[0]
     return np.asarray(estimated @ np.linalg.inv(true))
 
 
-def test_weight_of_errata_10_is_not_symmetric_and_may_be_singular() -> None:
-    """With Lambda = 1 and one delay for all, it is the sum of J_hat J^-1 over the arms plus T I."""
-    one = estimated_over_true((0.2, 3.0), (0.0, 0.2))
-    assert np.linalg.eigvalsh(0.5 * (one + one.T)) == pytest.approx([-5.447, 8.647], abs=1e-3)
+def test_errata_10_weight_may_be_asymmetric_and_singular() -> None:
+    """With Lambda = 1 and one delay for all, the weight is the sum of J_hat J^-1 over the arms plus T I."""
+    ratio = estimated_over_true((0.2, 3.0), (0.0, 0.2))
+    assert np.linalg.eigvalsh(0.5 * (ratio + ratio.T)) == pytest.approx(
+        [-5.447, 8.647], abs=1e-3
+    )
     # Its own eigenvalues are the ratios of the lengths, as a similar matrix shows.
-    assert np.sort(np.linalg.eigvals(one).real) == pytest.approx([0.2, 3.0])
+    assert np.sort(np.linalg.eigvals(ratio).real) == pytest.approx([0.2, 3.0])
     mirrored = estimated_over_true((0.2, 3.0), (0.5 * np.pi, -0.2))
-    weight = 0.5 * (one + mirrored)
+    weight = 0.5 * (ratio + mirrored)
     assert np.linalg.det(weight) < 0.0
     delay_s = -np.linalg.eigvals(weight).real.min()
     assert delay_s > 0.0
@@ -179,10 +185,10 @@ def test_weight_of_errata_10_is_not_symmetric_and_may_be_singular() -> None:
     ("lengths", "pose"),
     [((0.3, 2.0), (0.4, 0.3)), ((2.5, 0.4), (-1.0, 0.25)), ((1.6, 0.5), (2.0, -0.2))],
 )
-def test_wrong_lengths_make_the_weight_indefinite_near_a_straight_elbow(
+def test_wrong_lengths_make_straight_elbow_weight_indefinite(
     lengths: tuple[float, float], pose: tuple[float, float]
 ) -> None:
-    """A motion exists that the weight counts as negative; of true lengths it is the identity."""
+    """A motion exists that the weight counts as negative; with true lengths the weight is the identity."""
     weight = estimated_over_true(lengths, pose)
     assert np.abs(weight - weight.T).max() > 0.1
     assert np.linalg.eigvalsh(0.5 * (weight + weight.T)).min() < 0.0
@@ -190,7 +196,7 @@ def test_wrong_lengths_make_the_weight_indefinite_near_a_straight_elbow(
 
 
 @pytest.mark.long
-def test_errors_vanish_although_the_weight_of_errata_10_is_indefinite() -> None:
+def test_errors_vanish_despite_indefinite_errata_10_weight() -> None:
     """An end effector of finite reach cannot move at one velocity for ever: e and qd go to zero."""
     log = run(UNKNOWN, gain=LENGTH_GAIN, **{**WRONG, "duration_s": 60.0})
     apart_m = np.abs(places(log, "m") - places(log, "s")).max(axis=1)

@@ -1,7 +1,9 @@
-"""`adaptive_robust`: its torque, its mean-square bound under a disturbance, its energy, its linear loop.
+"""`adaptive_robust`: its torque, its mean-square bound under a disturbance, its energy, its
+linear loop.
 
-With d the disturbance, abs(d_j) <= rho_j, V' = - D + sum_i beta_i r'(d - rho r / sqrt(r^2 + w^2)), D what V
-dissipates without the robust term. Of x = abs(r) / w the last is at most rho w (x - x^2 / sqrt(1 + x^2)).
+Let d be the disturbance, abs(d_j) <= rho_j, and D the dissipation in V without the robust term.
+Then V' = - D + sum_i beta_i r'(d - rho r / sqrt(r^2 + w^2)). With x = abs(r) / w the last term
+is at most rho w (x - x^2 / sqrt(1 + x^2)).
 """
 
 import numpy as np
@@ -55,32 +57,38 @@ def run(law: str, more: str = "") -> Log:
 
 
 def mean_dissipation(log: Log, without: float) -> float:
-    """Mean over time of sum beta (r'Kp r + disagreement), and V at the start spread over it, W."""
+    """Returns the mean over time of sum beta (r'Kp r + disagreement), and V at the start
+    divided by the time, W.
+    """
     energies = compute_site_energies(log)
     beta = compute_energy_balance(energies).beta[0]
     total = 0.0
     for weight, energy in zip(beta, energies.values(), strict=True):
         motion = energy.motion
-        found = {name: one.total.sum() for name, one in compute_dissipation(motion).items()}
+        dissipation = {
+            name: power.total.sum() for name, power in compute_dissipation(motion).items()
+        }
         opposed = (
             motion.r * motion.constants.robust_torque(motion.r)
         ).sum() * motion.records.h_s
-        total += weight * (found["damping"] + found["disagreement"] - without * opposed)
+        total += weight * (
+            dissipation["damping"] + dissipation["disagreement"] - without * opposed
+        )
     return float(total / log.scenario.duration_s)
 
 
-def test_the_residue_is_the_largest_of_its_function() -> None:
-    found = minimize_scalar(
+def test_residue_is_the_maximum_of_its_function() -> None:
+    minimum = minimize_scalar(
         lambda x: x * x / np.sqrt(1.0 + x * x) - x, bounds=(0.0, 5.0), method="bounded"
     )
-    assert -found.fun == pytest.approx(ROBUST_RESIDUE, rel=1e-9)
+    assert -minimum.fun == pytest.approx(ROBUST_RESIDUE, rel=1e-9)
     r = np.linspace(-30.0, 30.0, 2001)
     worst = max(abs(x) * 2.0 - x * robust_torque(2.0, 0.4, x) for x in r)
     assert worst <= ROBUST_RESIDUE * 2.0 * 0.4
 
 
 @pytest.mark.long
-def test_dissipation_stays_below_its_bound_unlike_that_of_the_box() -> None:
+def test_robust_dissipation_stays_bounded_unlike_the_box() -> None:
     def bound(log: Log) -> float:
         balance = compute_energy_balance(compute_site_energies(log))
         robust_w = ROBUST_RESIDUE * float(balance.beta[0].sum()) * 2 * RHO_NM * WIDTH_RAD_S
@@ -91,20 +99,20 @@ def test_dissipation_stays_below_its_bound_unlike_that_of_the_box() -> None:
     assert mean_dissipation(box, 0.0) > bound(box)
 
 
-def test_its_energy_closes_with_friction_that_it_does_not_know() -> None:
+def test_energy_closes_with_unknown_friction() -> None:
     robust = 'law = "adaptive_robust"\nrho_nm = 1.5\nwidth_rad_s = 0.1\nfriction = 0.25'
     text = ROUGH.replace('law = "adaptive"', robust)
     log = trilat_net.simulate(parse_scenario(f"{text}{rough_urdf()}'''"))
     energies = compute_site_energies(log)
     balance = compute_energy_balance(energies)
     friction = sum(
-        one.total for one in (compute_work(e.motion)["friction"] for e in energies.values())
+        power.total for power in (compute_work(e.motion)["friction"] for e in energies.values())
     )
     assert np.abs(np.cumsum(friction)).max() >= 0.01 * balance.V.max()
     assert np.abs(balance.unexplained).max() <= 2e-4 * balance.V.max()
 
 
-def test_to_a_small_motion_it_is_a_larger_kp() -> None:
+def test_small_motions_see_a_larger_kp() -> None:
     """The slope of the robust term where r = 0 is rho / width."""
 
     def static(law: str, more: str) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Two layers on the unit arm: numbers of independent simulations. A tank there has the energy of both joints.
+"""Two layers on the unit arm: numbers of independent simulations.
 
-On the line q2 = q1 / 2 that is 1.25 times the energy of x: the level is 0.125 J for 0.1, filling 40 for 50.
-
-The laws that keep account of energy: what they observe under delays that vary; drivers agree; verify.
+There a tank has the energy of both joints. On the line q2 = q1 / 2 that is 1.25 times the
+energy of x: the level is 0.125 J for 0.1, filling 40 for 50. The laws that account for energy:
+their observed energies under delays that vary; drivers agree; verify.
 """
 
 import io
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.energy_runs import JITTER, LAWS, MOBILE, drawn, least_energy, pair, ticked
+from tests.energy_runs import JITTER, LAWS, MOBILE, draw_energy_run, least_energy, pair, ticked
 from tests.log_editing import opened
 from tests.unit_arm import H50, hand, unit_scenario
 from tests.virtual_runs import sampled, trajectories
@@ -24,7 +24,7 @@ TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40
 
 
 @pytest.mark.long
-def test_free_motion_of_a_layer_that_alone_diverges() -> None:
+def test_tanks_keep_a_diverging_layer_finite() -> None:
     run = ticked(pair(TANKS, clamped=False, duration_s=30.0), every=2)
     m, s = run["m"], run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-5)
@@ -48,15 +48,15 @@ def test_the_layer_alone_diverges() -> None:
     assert 0.01 * (1 + np.argmax(speed > 999.0)) == pytest.approx(11.4, abs=0.05)
 
 
-def test_contact_feels_as_the_layer_makes_it() -> None:
+def test_contact_feels_like_the_layer() -> None:
     m = ticked(pair(TANKS, clamped=True, duration_s=30.0), every=30000)["m"]
     assert abs(m.tau_x[-1, 0]) / m.q[-1, 0] == pytest.approx(90.909, abs=5e-4)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("by_shares", [False, True])
-def test_any_shares_keep_tanks_from_being_overdrawn(by_shares: bool) -> None:
-    """A ring in which each follows the next, as irreversible as can be."""
+def test_no_shares_overdraw_the_tanks(by_shares: bool) -> None:
+    """A ring in which each follows the next, which is as irreversible as possible."""
     ring = {
         "m1": {"m2": 1.0, "s": 0.0},
         "m2": {"m1": 0.0, "s": 1.0},
@@ -71,7 +71,7 @@ def test_any_shares_keep_tanks_from_being_overdrawn(by_shares: bool) -> None:
         assert np.abs(run["s"].q[-1, 0] - 0.3) < 0.02
 
 
-def test_a_tank_sends_no_more_than_it_has() -> None:
+def test_a_tank_sends_at_most_its_energy() -> None:
     lines = describe_law_conditions(
         pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
     )
@@ -105,14 +105,14 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
     [range(2), pytest.param(range(2, 200), marks=pytest.mark.long)],
     ids=str,
 )
-def test_no_energy_is_negative_at_any_tick_of_drawn_runs(law: str, seeds: range) -> None:
+def test_drawn_runs_never_have_negative_energy(law: str, seeds: range) -> None:
     """Half lost, 4g, jitter; contact and pushes; ramps of dominance; drift compensation is on."""
-    least = {seed: least_energy(ticked(drawn(law, seed))) for seed in seeds}
-    assert {seed: one for seed, one in least.items() if one < -1e-9} == {}
+    least = {seed: least_energy(ticked(draw_energy_run(law, seed))) for seed in seeds}
+    assert {seed: energy for seed, energy in least.items() if energy < -1e-9} == {}
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
+def test_compiled_and_stepped_runs_agree_and_verify(law: str) -> None:
     scenario = pair(LAWS[law], clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0})
     run, last = trajectories(scenario), sampled(scenario, (1.6,))[:, -1]
     for n, name in enumerate(scenario.names):
@@ -130,7 +130,7 @@ def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_scenario_says_what_its_law_rests_on(law: str) -> None:
+def test_a_scenario_states_its_laws_premises(law: str) -> None:
     (line, *_) = describe_law_conditions(pair(LAWS[law], clamped=False, duration_s=1.0))
     assert line.startswith(f"condition of {law} at m")
     assert "holds: motion stays bounded (decay is not proved)" in line
@@ -139,5 +139,5 @@ def test_a_scenario_says_what_its_law_rests_on(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_passivity_is_no_proof_that_motion_decays(law: str) -> None:
+def test_passivity_does_not_prove_decay(law: str) -> None:
     assert list_law_proofs(pair(LAWS[law], clamped=False, duration_s=1.0)) == []

@@ -41,9 +41,9 @@ def three(
 
 def test_the_tangent_is_that_of_the_mathematics_library() -> None:
     values = np.concatenate([np.linspace(-25.0, 25.0, 4001), np.logspace(-300.0, 1.0, 500)])
-    found = np.array([tanh(value) for value in values])
-    assert np.abs(found - np.tanh(values)).max() <= 3e-16
-    assert (found == -np.array([tanh(-value) for value in values])).all()
+    tangents = np.array([tanh(value) for value in values])
+    assert np.abs(tangents - np.tanh(values)).max() <= 3e-16
+    assert (tangents == -np.array([tanh(-value) for value in values])).all()
     assert (tanh(0.0), tanh(math.inf), tanh(-math.inf)) == (0.0, 1.0, -1.0)
     assert math.isnan(tanh(math.nan))
 
@@ -59,7 +59,7 @@ def test_a_saturated_pull_ends_at_its_limit() -> None:
     assert -linear["tau_x"][0, 0] == pytest.approx(9.677, abs=5e-4)
 
 
-def test_saturation_turns_the_weighted_mean_into_a_vote() -> None:
+def test_saturation_makes_the_weighted_mean_a_vote() -> None:
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}}
     vote = last_rows(three(SATURATED, (0.9, 0.1), sites), 40.0)[0]
     assert vote["q"][:, 0] == pytest.approx([0.2444, -0.2, 0.2389], abs=5e-5)
@@ -67,7 +67,7 @@ def test_saturation_turns_the_weighted_mean_into_a_vote() -> None:
     assert mean["q"][:, 0] == pytest.approx([0.135, -0.015, 0.120], abs=5e-4)
 
 
-def test_lee_and_spong_feel_clamp_and_drag_common_motion() -> None:
+def test_lee_and_spong_drag_common_motion() -> None:
     """The drag of both arms at one speed is 2 d + 2 K T = 4 K T at the bound."""
     law = {"law": "lee_spong", "K": 100.0, "Kd": 3.0, "T_max_ms": 200.0}
     clamped = last_rows(two(law, clamped=True), 30.0)[0]
@@ -86,22 +86,22 @@ def test_lee_and_spong_feel_clamp_and_drag_common_motion() -> None:
         ("digital", 0.0, 0.09, False),
     ],
 )
-def test_bound_of_lee_and_spong_is_met_at_edge(
+def test_lee_and_spong_bound_holds_at_edge(
     scheme: str, more_ms: float, P_e: float, holds: bool
 ) -> None:
     """As published, and with K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
-    told = describe_law_conditions(
+    conditions = describe_law_conditions(
         unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme)
     )
     text = "4 (d1 - K1 h / 2) (d2" if scheme == "digital" else "4 d1 d2 >= (T1 + T2)^2 K1 K2"
-    assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in told[0]
+    assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in conditions[0]
 
 
 @pytest.mark.long
 def test_users_share_authority_and_feel_no_environment() -> None:
-    """Hands that end at +-0.3 under the guidance that they feel, K (1 - a_i) 0.6."""
+    """Hands end at +-0.3 under the guidance that they feel, K (1 - a_i) 0.6."""
     stiff: dict[str, Any] = {
         "kind": "spring",
         "stiffness_nm_rad": 1e5,
@@ -123,22 +123,22 @@ def test_users_share_authority_and_feel_no_environment() -> None:
         rest = last_rows(scenario, 40.0)[0]
         assert rest["q"][:, 0] == pytest.approx([0.3, -0.3, slave], abs=1e-9)
         assert rest["tau_x"][:2, 0] == pytest.approx([-15.0, 45.0], abs=1e-4)
-    told = " ".join(describe_law_conditions(scenario))
+    text = " ".join(describe_law_conditions(scenario))
     bound = "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, T1 + T2 + h = 401 ms"
-    assert f"authority at m1, m2 holds: {bound}" in told
-    assert "authority at s holds: it follows and closes no loop" in told
+    assert f"authority at m1, m2 holds: {bound}" in text
+    assert "authority at s holds: it follows and closes no loop" in text
 
 
 def test_a_single_user_closes_no_loop() -> None:
     law = {"law": "authority", "K": 100.0, "d": 20.0}
     followers = {name: {"control": {"leads": False}} for name in TRIO[1:]}
     scenario = three(law, (0.75, 0.25), {TRIO[0]: {}, **followers})
-    told = " ".join(describe_law_conditions(scenario))
-    assert f"authority at {TRIO[0]} holds: nobody follows anybody" in told
+    text = " ".join(describe_law_conditions(scenario))
+    assert f"authority at {TRIO[0]} holds: nobody follows anybody" in text
 
 
 @pytest.mark.long
-def test_impedances_give_way_as_they_are_set() -> None:
+def test_impedances_yield_as_configured() -> None:
     push = {"kind": "recorded", "points": [[0.0, 0.0, 0.0], [1.0, 3.0, 3.0], [100.0, 3.0, 3.0]]}
     law = {"law": "impedance", "K": 50.0}
     sites: dict[str, Any] = {"m1": {"hands": [push]}, "s": {"control": {"follows": True}}}
@@ -159,7 +159,7 @@ PULSE = {"kind": "pulse", "start_s": 0.5, "end_s": 0.8, "peak_nm": [1.0, 0.5]}
 
 
 def spring(stiffness: float) -> dict[str, Any]:
-    """A hand or a wall without damping at the start pose."""
+    """Returns a hand or a wall without damping at the start pose."""
     return {**CLAMP, "stiffness_nm_rad": stiffness}
 
 
@@ -184,7 +184,7 @@ def impedances(
 
 
 def peak_motion(scenario: Scenario, first_s: float, last_s: float) -> float:
-    """The largest motion of the slave over a time, at steps of 20 ms."""
+    """Returns the largest motion of the slave over a time, at steps of 20 ms."""
     rows = last_rows(scenario, *np.arange(first_s, last_s, 0.02))
     return max(float(np.abs(row["q"][1]).max()) for row in rows)
 
@@ -215,7 +215,7 @@ HELD_LOOPS = {
 
 
 def largest_loop_gain(loop: dict[str, float], hand: float) -> float:
-    """The largest gain over all frequencies, with a spring hand at the master."""
+    """Returns the largest gain over all frequencies, with a spring hand at the master."""
     M, B, K, K_s, K_e, _ = loop.values()
     s = 1j * np.geomspace(0.1, 100.0, 20001)
     slave = K_e * (K_s + B * s) / (M * s**2 + B * s + K_s + K_e)
@@ -223,7 +223,8 @@ def largest_loop_gain(loop: dict[str, float], hand: float) -> float:
 
 
 def rightmost_root(loop: dict[str, float], delay_ms: float, near: complex) -> complex:
-    """Root of (M s^2 + B s + K_s + K_e) (M s^2 + B s + K + k) + K_e (K_s + B s) e^(-s T) by Newton.
+    """Returns the root of (M s^2 + B s + K_s + K_e) (M s^2 + B s + K + k) + K_e (K_s + B s)
+    e^(-s T) by Newton.
 
     T is the delay of both ways.
     """
@@ -247,7 +248,7 @@ def rightmost_root(loop: dict[str, float], delay_ms: float, near: complex) -> co
         *(pytest.param(name, marks=pytest.mark.long) for name in [*HELD_LOOPS][1:]),
     ],
 )
-def test_a_spring_hand_at_a_master_voids_the_small_gain_of_free_masters(name: str) -> None:
+def test_a_masters_spring_hand_voids_small_gain(name: str) -> None:
     loop, delay_ms, growth_per_s = HELD_LOOPS[name]
     M, _, K, _, _, k = loop.values()
     root = rightmost_root(loop, delay_ms, 0.3 + 1j * np.sqrt((K + k) / M))
@@ -262,24 +263,26 @@ def test_a_spring_hand_at_a_master_voids_the_small_gain_of_free_masters(name: st
 
 
 @pytest.mark.parametrize("name", HELD_LOOPS)
-def test_condition_states_the_gain_with_the_hands_at_the_masters(name: str) -> None:
+def test_the_condition_includes_the_masters_hands(name: str) -> None:
     """A weak hand leaves the gain below one, and the strongest hand does not."""
     loop, delay_ms, _ = HELD_LOOPS[name]
     for held, verdict in ((0.0, "holds"), (3.0, "holds"), (loop["hand"], "does not hold")):
-        told = describe_law_conditions(impedances(loop, constant(delay_ms), 12.0, hand=held))[0]
+        condition = describe_law_conditions(
+            impedances(loop, constant(delay_ms), 12.0, hand=held)
+        )[0]
         # the hand may let go
         gain = max(largest_loop_gain(loop, 0.0), largest_loop_gain(loop, held))
-        assert f" {verdict}: the loop gain is at most " in told
-        stated = float(told.partition("at most ")[2].partition(",")[0])
+        assert f" {verdict}: the loop gain is at most " in condition
+        stated = float(condition.partition("at most ")[2].partition(",")[0])
         assert stated == pytest.approx(gain, rel=5e-3)
 
 
-def test_condition_of_a_free_slave_states_the_stiffest_wall() -> None:
+def test_free_slave_condition_names_the_stiffest_wall() -> None:
     untouched = impedances(LOOP, constant(20.0), 12.0, hand=LOOP["hand"], wall=False)
     assert "up to 6.123 N m/rad at the slave" in describe_law_conditions(untouched)[0]
 
 
-def test_hands_that_are_no_springs_leave_the_small_gain_undecided() -> None:
+def test_other_hands_leave_small_gain_undecided() -> None:
     point = {"kind": "tip_spring", "to_m": [1.0, 0.5], "stiffness_n_m": [50.0, 50.0]}
     law = {"law": "impedance"}
     for hand_ in (point, {**spring(5.0), "sampled": True}):
@@ -303,13 +306,13 @@ SWINGS = (
 """Mean, amplitude, in ms, and period, in s, of a delay, and the rate of the growth, in 1/s."""
 
 
-def test_a_gain_below_one_is_undecided_where_delays_vary() -> None:
-    told = describe_law_conditions(impedances(SWINGING, SWING, 10.0))[0]
-    assert "is undecided: known for constant delays" in told
-    told = describe_law_conditions(impedances(SWINGING, constant(440.0), 10.0))[0]
-    assert " holds: the loop gain is at most 0.9" in told
-    told = describe_law_conditions(impedances(SWINGING, SWING, 10.0, wall=False))[0]
-    assert " holds: the slave touches nothing" in told
+def test_gains_below_one_need_constant_delays() -> None:
+    condition = describe_law_conditions(impedances(SWINGING, SWING, 10.0))[0]
+    assert "is undecided: known for constant delays" in condition
+    condition = describe_law_conditions(impedances(SWINGING, constant(440.0), 10.0))[0]
+    assert " holds: the loop gain is at most 0.9" in condition
+    condition = describe_law_conditions(impedances(SWINGING, SWING, 10.0, wall=False))[0]
+    assert " holds: the slave touches nothing" in condition
 
 
 @pytest.mark.long
@@ -317,10 +320,10 @@ def test_a_gain_below_one_is_undecided_where_delays_vary() -> None:
     ("delay_ms", "amplitude_ms", "period_s", "growth_per_s"),
     SWINGS,
 )
-def test_a_delay_that_varies_makes_a_small_gain_grow(
+def test_a_varying_delay_makes_small_gains_grow(
     delay_ms: float, amplitude_ms: float, period_s: float, growth_per_s: float
 ) -> None:
-    """Constant delays of the range of a delay that swings decay."""
+    """Constant delays within the range of the swinging delay decay."""
     swing = {
         "model": "sine",
         "delay_ms": delay_ms,
@@ -356,17 +359,17 @@ def test_a_prediction_removes_the_delay_from_the_loop() -> None:
 
 
 @pytest.mark.long
-def test_a_prediction_that_lacks_the_contact_is_unstable_there() -> None:
+def test_predictions_that_lack_contact_are_unstable_there() -> None:
     rows = last_rows(two(SMITH, clamped=True, control={"predicts": True}), 20.0)[0]
     assert abs(rows["qd"]).max() > 1.0
 
 
-def test_a_law_that_compares_joints_is_refused_in_task_space() -> None:
+def test_joint_space_laws_are_refused_in_task_space() -> None:
     with pytest.raises(ScenarioError, match="saturated_pd compares arms joint by joint"):
         load_scenario("unlike_arms", {"control": SATURATED})
 
 
-def test_saturated_pull_and_gravity_must_fit_below_torque_limit() -> None:
+def test_saturated_pull_and_gravity_stay_below_limits() -> None:
     """The largest gravity over all poses of the textbook's arm."""
     changes = {"control.law": "saturated_pd", "control.P": 5.0, "control.d": 4.0}
     scenario = load_scenario("paper", changes)

@@ -19,7 +19,7 @@ with (ROOT / "docs/data/laws-unit-arm.csv").open(encoding="utf-8", newline="") a
 
 
 class WaveOfVelocity(WAVE):  # type: ignore[misc, valid-type]
-    """A wave line whose waves carry qd h instead of the step that the arm made."""
+    """A wave line whose waves carry qd h instead of the arm's actual step."""
 
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
 
@@ -55,7 +55,7 @@ def felt_stiffness(run: dict[str, Any], to_s: int) -> float:
     return float(abs(run["m"].tau_x[rows, 0]).mean() / run["m"].q[rows, 0].mean())
 
 
-def test_every_number_names_a_test() -> None:
+def test_every_number_names_its_test() -> None:
     assert len(ROWS) > 80
     assert [row for row in ROWS if not (row["test"] and (ROOT / row["test"]).is_file())] == []
 
@@ -76,7 +76,7 @@ def test_distance_of_a_line_whose_waves_carry_velocity() -> None:
 
 
 @pytest.mark.long
-def test_an_acceleration_margin_costs_stiffness_for_as_long_as_it_lasts() -> None:
+def test_an_acceleration_margin_lowers_stiffness_while_active() -> None:
     run = run_contact(120.0, duration_s=30.0, acceleration_rad_s2=100.0)
     assert list_values("stiffness felt") == [
         pytest.approx(felt_stiffness(run, to_s), abs=0.06) for to_s in (20, 30)

@@ -1,4 +1,4 @@
-"""A control law is one file: whoever knows laws knows one that was put beside the others."""
+"""A control law is one file: the program finds a law that was put beside the others."""
 
 from pathlib import Path
 
@@ -55,16 +55,16 @@ print(json.dumps({
 """
 
 
-def test_a_file_beside_the_others_is_a_law_everywhere(tmp_path: Path) -> None:
+def test_an_added_file_is_a_law_everywhere(tmp_path: Path) -> None:
     (tmp_path / "soft_spring.py").write_text(LAW)
-    found = look(LOOK, tmp_path)
-    assert found["control"] == [9.0, 9.0]
+    output = look(LOOK, tmp_path)
+    assert output["control"] == [9.0, 9.0]
     assert any(
-        "condition of soft_spring" in line and "K = 9 at s" in line for line in found["check"]
+        "condition of soft_spring" in line and "K = 9 at s" in line for line in output["check"]
     )
-    assert found["identical"]
-    assert (found["knobs"], found["tuned"]) == (["K"], ["soft_spring"])
-    assert (found["suite"], found["two"]) == (True, False)
+    assert output["identical"]
+    assert (output["knobs"], output["tuned"]) == (["K"], ["soft_spring"])
+    assert (output["suite"], output["two"]) == (True, False)
 
 
 @pytest.mark.parametrize("name", list(BUILT_IN))

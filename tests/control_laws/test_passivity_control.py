@@ -1,4 +1,4 @@
-"""Time-domain passivity control on the unit arm: numbers of independent simulations, and what it is for."""
+"""Time-domain passivity control on the unit arm: numbers of independent simulations, and its purpose."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ def run(
 
 
 def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any:
-    """Without controllers, which is no choice of a scenario; hands as they are sampled."""
+    """Returns a run without controllers, which no scenario can choose; hands are sampled."""
     law = {
         "law": "trilat_net.laws.tdpa:Tdpa",
         **PUBLISHED,
@@ -50,7 +50,7 @@ def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any
     )
 
 
-def felt(result: Any) -> float:
+def find_felt_stiffness(result: Any) -> float:
     return float(abs(result["m"].tau_x[-1, 0] / result["m"].q[-1, 0]))
 
 
@@ -59,7 +59,7 @@ def test_without_controllers_the_channel_is_active() -> None:
     free = watching(50.0, clamped=False)
     assert free["s"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert least_energy(free) == pytest.approx(-3.3e-3, abs=5e-5)
-    assert felt(watching(50.0, clamped=True)) == pytest.approx(90.91, abs=5e-3)
+    assert find_felt_stiffness(watching(50.0, clamped=True)) == pytest.approx(90.91, abs=5e-3)
     fast = watching(200.0, clamped=False)["m"].qd[:, 0]
     assert np.abs(fast).max() > 50.0
 
@@ -84,23 +84,25 @@ def test_free_motion_drifts_unless_drift_is_paid_for(
 
 def test_contact_stays_bounded() -> None:
     near, far = run(50.0, clamped=True), run(200.0, clamped=True)
-    assert felt(near) == pytest.approx(68.88, rel=1e-3)
+    assert find_felt_stiffness(near) == pytest.approx(68.88, rel=1e-3)
     # it chatters: the last digits are the integrator's
-    assert felt(far) == pytest.approx(26.7, rel=0.04)
+    assert find_felt_stiffness(far) == pytest.approx(26.7, rel=0.04)
     assert np.abs(far["m"].qd[-100:, 0]).max() < 0.03
     assert least_energy(near) >= -1e-15
     assert least_energy(far) >= -1e-15
 
 
 def mean_felt(result: Any) -> float:
-    """Over the last half of a run, N m/rad: as it is published it chatters."""
+    """Returns the mean over the last half of a run, N m/rad, because the published law chatters."""
     half = len(result["m"].q) // 2
     return float(abs(result["m"].tau_x[half:, 0]).mean() / result["m"].q[half:, 0].mean())
 
 
 @pytest.mark.long
-def test_books_of_steps_cost_no_stiffness_unlike_an_acceleration_margin() -> None:
-    """34.9 N m/rad as it is published, 71.8 by spring and clamp alone; the margin costs two thirds."""
+def test_books_of_steps_keep_their_stiffness() -> None:
+    """34.9 N m/rad as published, 71.8 by spring and clamp alone; the acceleration margin costs
+    two thirds.
+    """
     assert mean_felt(run_contact(120.0, **PUBLISHED)) == pytest.approx(34.9, rel=1e-2)
     by_step = run_contact(120.0)
     assert mean_felt(by_step) == pytest.approx(43.9, rel=1e-2)
@@ -129,8 +131,10 @@ TURNED = {
 
 
 @pytest.mark.long
-def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
-    """The weighted pose jumps, the goal does not; while masters rest, nothing pays for what is left."""
+def test_later_motion_pays_for_dominance_changes() -> None:
+    """The weighted pose jumps, the goal does not; while masters rest, nothing pays for the
+    remaining distance.
+    """
     sites = {
         "m1": {"hands": [hand(0.3, 100.0, 15.0)]},
         "m2": {"hands": [hand(-0.3, 100.0, 15.0)]},
@@ -153,8 +157,8 @@ def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
         assert run["s"].q[-1, 0] > 0.1 * m1 + 0.9 * m2 + 0.05
 
 
-def test_every_site_follows_unless_told_otherwise() -> None:
-    """An arm that nobody holds comes to rest with the others, where a leader's alone would coast."""
+def test_every_site_follows_by_default() -> None:
+    """An arm that nobody holds comes to rest with the others; with a leader alone it would coast."""
     sites = {
         "m": {
             "hands": [{"kind": "pulse", "start_s": 0.1, "end_s": 0.4, "peak_nm": [2.0, 1.0]}]
@@ -175,21 +179,23 @@ def test_every_site_follows_unless_told_otherwise() -> None:
 
 
 @pytest.mark.parametrize("clamped", [False, True])
-def test_energy_is_what_the_arm_gets(clamped: bool) -> None:
-    """The leader's account, told again from torque and step; books of velocity are off by tau qdd h^2 / 2."""
+def test_booked_energy_is_the_arms(clamped: bool) -> None:
+    """The leader's account, recomputed from torque and step; books of velocity are off by tau
+    qdd h^2 / 2.
+    """
     known = {"energy": "step", "reserve_J": 1e-3}
     result = run(50.0, clamped=clamped, duration_s=6.0, every=1, **known)
     m, s = result["m"], result["s"]
     step = -m.tau[:-1, 0] * np.diff(m.q[:, 0])
     assert m.sent[0].E_led[-1, 0] == pytest.approx(np.maximum(step, 0.0).sum(), rel=1e-9)
     out = np.cumsum(np.minimum(step, 0.0))
-    came = s.sent[0].E_followed[1:-50, 0]  # 50 ms ago
-    assert np.abs(m.sent[0].W_led[51:, 0] - (1e-3 + came + out[50:])).max() < 1e-12
+    earlier_energy = s.sent[0].E_followed[1:-50, 0]  # 50 ms ago
+    assert np.abs(m.sent[0].W_led[51:, 0] - (1e-3 + earlier_energy + out[50:])).max() < 1e-12
     assert least_energy(result) >= -1e-15
 
 
 @pytest.mark.long
-def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
+def test_a_mesh_observes_no_energy_of_its_own() -> None:
     shares = {
         "m1": {"m2": 0.1, "s": 0.9},
         "m2": {"m1": 0.4, "s": 0.6},
@@ -202,6 +208,6 @@ def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
         assert least_energy(ticked(scenario, every=7)) >= -1e-12
 
 
-def test_books_of_torque_that_is_held_are_for_digital_alone() -> None:
+def test_held_torque_books_need_the_digital_scheme() -> None:
     with pytest.raises(ScenarioError, match="choose 'digital'"):
         pair_of({"law": "tdpa"}, clamped=False, duration_s=1.0, scheme="second_order")

@@ -40,7 +40,7 @@ EXACT = [name for name in GAINS if name != "lee_spong"]  # its K T_max is rounde
 
 
 def build(name: str, scenario: str) -> tuple[Any, SiteArrays]:
-    """A law with a different gain for each joint, and the arrays of its site."""
+    """Returns a law with a different gain for each joint, and the arrays of its site."""
     setup = load_scenario(scenario).setup(SITE)
     gains: dict[str, tuple[float, ...]] = {}
     for key, first in GAINS[name].items():
@@ -54,7 +54,7 @@ def build(name: str, scenario: str) -> tuple[Any, SiteArrays]:
 
 
 def put_random_state(row: Any, rng: np.random.Generator, *, exact: bool = False) -> None:
-    """Writes a random state; exact: sums and products of its numbers need no rounding."""
+    """Writes a random state; with `exact`, sums and products of its numbers need no rounding."""
     for name in ("q", "qd", "q_des", "qd_des", "felt", "theta_hat", "Yr"):
         values = rng.uniform(-2.0, 2.0, row[name].shape)
         row[name] = np.round(32.0 * values) / 32.0 if exact else values
@@ -63,7 +63,7 @@ def put_random_state(row: Any, rng: np.random.Generator, *, exact: bool = False)
 def compute_plain_torque(
     law: Any, row: Any, Y: Array, gravity: Array, joint_friction: Array | None = None
 ) -> Array:
-    """The torque by the law's own file; Y is the regressor for the estimate in the row."""
+    """Returns the torque by the law's own file; Y is the regressor for the estimate in the row."""
     n = len(gravity)
     e, ed, r, qd = (np.array(row[name][:n]) for name in ("e", "ed", "r", "qd"))
     name = law.tag
@@ -97,7 +97,7 @@ def test_planar_arm_has_the_plain_torque(name: str) -> None:
 
 @pytest.mark.parametrize("name", LEARNING)
 @pytest.mark.parametrize("scenario", [PLANAR, CHAIN])
-def test_estimate_advances_as_in_the_plain_law(name: str, scenario: str) -> None:
+def test_estimates_advance_as_in_the_plain_law(name: str, scenario: str) -> None:
     law, arrays = build(name, scenario)
     stages = chain_stages if scenario == CHAIN else two_link_stages
     row = arrays.site[0]

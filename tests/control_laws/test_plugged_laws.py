@@ -1,4 +1,4 @@
-"""What holds for every built-in law that is plugged in: bits, replay, the scenario that names it."""
+"""Rules for every built-in law that is plugged in: bits, replay, the scenario that names the law."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ def scenario(law: str) -> Scenario:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_scenario_names_it_and_its_check_tells_its_condition(law: str) -> None:
+def test_checking_scenarios_states_the_laws_condition(law: str) -> None:
     lines = describe_scenario(scenario(law))
     assert (
         len([line for line in lines if line.startswith("condition of ") and law in line]) >= 1
@@ -39,9 +39,7 @@ def test_a_scenario_names_it_and_its_check_tells_its_condition(law: str) -> None
 
 
 @pytest.mark.parametrize("law", LONG)
-def test_its_runs_are_the_same_bits_by_whatever_driver(
-    law: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = scenario(law)
     ticks = trajectories(chosen)
     fused = sampled(chosen, (0.12,))[:, 0]
@@ -58,7 +56,7 @@ def test_its_runs_are_the_same_bits_by_whatever_driver(
 
 
 @pytest.mark.parametrize("law", LONG)
-def test_its_log_is_executed_again(law: str) -> None:
+def test_logs_of_plugged_laws_can_be_reexecuted(law: str) -> None:
     log = opened(recorded(LAWS[law][0], overrides(law)))
     verdict = verify(log)
     assert verdict.whole_run
@@ -73,7 +71,7 @@ RULE: dict[str, Any] = {"action": "glide", "align_limit_rad": 4.0, "align_speed_
 
 
 def set_apart(law: str, **more: Any) -> Scenario:
-    """Arms 3 rad apart, which align at 2 rad/s."""
+    """Sets arms 3 rad apart, which align at 2 rad/s."""
     name, settings = LAWS.get(law, ("two_sites" if law in FOR_TWO else "paper", {}))
     first, *others = load_scenario(name).names
     keys = {
@@ -89,7 +87,7 @@ def set_apart(law: str, **more: Any) -> Scenario:
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", [law for law in ALL_LAWS if law != "own"])
-def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> None:
+def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
     """Arms begin 3 rad apart, links are cut, a site is stopped, the first one in fault; from tick 0 on."""
     more: dict[str, Any] = {
         "duration_s": 9.0,
@@ -101,7 +99,7 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
             {"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}
         ),  # elbows bent, and none hangs
     }
-    apart = set_apart(law, **more)
+    far_scenario = set_apart(law, **more)
     orders = {
         "s": {
             2800: "stop",
@@ -111,7 +109,7 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
             7000: "stop",
             7040: "enable",
         },
-        apart.names[0]: {
+        far_scenario.names[0]: {
             5500: "arm_lost",
             5530: "stop",
             6000: "reset",
@@ -119,7 +117,7 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
             6400: "reset",
         },
     }
-    log = ordered(apart, orders)
+    log = ordered(far_scenario, orders)
     modes = {str(mode) for site in log.sites for mode in log[site].mode}
     assert {"waiting", "return", "run", "hold", "stopped", "fault"} <= modes
     for site in log.sites:
@@ -137,10 +135,14 @@ CALM = [
 @pytest.mark.parametrize(
     "law", [x if x in DIGITAL else pytest.param(x, marks=pytest.mark.long) for x in CALM]
 )
-def test_arms_that_begin_far_apart_come_together_slowly(law: str) -> None:
-    """3 rad apart, at 2 rad/s and what the law adds, at the start and after a stop; no spring is wound up."""
-    apart = set_apart(law, duration_s=6.0)
-    unheld = load_scenario(apart, {f"sites.{site}.hands": [] for site in apart.names})
+def test_arms_far_apart_approach_slowly(law: str) -> None:
+    """3 rad apart, at 2 rad/s and the law's own speed, at the start and after a stop; no spring
+    is wound up.
+    """
+    far_scenario = set_apart(law, duration_s=6.0)
+    unheld = load_scenario(
+        far_scenario, {f"sites.{site}.hands": [] for site in far_scenario.names}
+    )
     log = ordered(unheld, {"s": {1200: "stop", 4000: "enable"}})
     for site in log.sites:
         assert np.abs(log[site].qd).max() < 2.5 * RULE["align_speed_rad_s"], site

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from tests.log_editing import opened
-from tests.transmission import PAIR, TABLE, VARIANTS, printed, rightmost_root, transmitted
+from tests.transmission import (
+    PAIR,
+    TABLE,
+    VARIANTS,
+    approximate_printed,
+    rightmost_root,
+    transmitted,
+)
 from tests.unit_arm import DRIVE, WALL, last_rows, two_sites, unit_scenario
 from tests.virtual_runs import trajectories
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
@@ -84,37 +91,37 @@ def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> 
 
 
 def measured(scenario: Scenario, site: str) -> float:
-    """The same as `transmitted` at 1 Hz, of a run in time: over its last period."""
+    """Returns the same as `transmitted` at 1 Hz, for a run in time: over its last period."""
     times_s = 8.0 + np.arange(1, 21) / 20.0
-    place = scenario.names.index(site)
+    site_index = scenario.names.index(site)
     rows = last_rows(scenario, *times_s)
     turn = np.exp(-2j * np.pi * times_s)
     torque, speed = (
-        np.array([row[name][place, 0] for row in rows]) for name in ("tau_x", "qd")
+        np.array([row[name][site_index, 0] for row in rows]) for name in ("tau_x", "qd")
     )
     return float(abs((torque @ turn) / (speed @ turn)) / abs(500.0 / (2j * np.pi) + 5.0))
 
 
 @pytest.mark.parametrize(("variant", "delay_s"), TABLE)
-def test_two_sites_transmit_what_the_literature_says(variant: str, delay_s: float) -> None:
-    found = [
+def test_two_sites_transmit_as_published(variant: str, delay_s: float) -> None:
+    ratios = [
         transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
-    assert found == [printed(value) for value in TABLE[variant, delay_s]]
+    assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
 
 
 @pytest.mark.parametrize("a", SHARED)
-def test_the_dominance_factor_shares_out_what_users_feel(a: float) -> None:
+def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
     alpha = complementary_shares(a)
     *users, root, ratios = SHARED[a]
     for at, values in enumerate(users):
-        found = [
+        felt_ratios = [
             transmitted(hz, alpha, at, acceleration=qdd)
             for qdd in (0.0, 1.0)
             for hz in (0.1, 1.0)
         ]
-        assert found == [printed(value) for value in values]
+        assert felt_ratios == [approximate_printed(value) for value in values]
     assert rightmost_root(alpha, USERS) == pytest.approx(root, abs=5e-4)
     beta = np.array(complementary_weights(a))
     assert beta @ (np.eye(3) - alpha) == pytest.approx(0.0, abs=1e-15)
@@ -136,9 +143,7 @@ def test_the_dominance_factor_shares_out_what_users_feel(a: float) -> None:
         (0.0, 1, 0.8968),
     ],
 )
-def test_a_run_of_the_six_channel_law_transmits_as_much(
-    a: float, user: int, felt: float
-) -> None:
+def test_six_channel_runs_transmit_like_their_loop(a: float, user: int, felt: float) -> None:
     assert measured(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(felt, abs=6e-5)
 
 
@@ -155,19 +160,19 @@ def test_a_run_of_the_six_channel_law_transmits_as_much(
         ("no forces", 0.02, 0.0, 0.1912),
     ],
 )
-def test_run_of_four_channel_law_transmits_as_its_loop_says(
+def test_four_channel_runs_transmit_like_their_loop(
     variant: str, delay_s: float, acceleration: float, felt: float
 ) -> None:
-    """With a part of the acceleration, as all of it is unstable; a held torque counts as what it is."""
-    found = measured(two_sites(variant, delay_s, acceleration=acceleration), "m")
+    """With a part of the acceleration, as all of it is unstable; a held torque is modelled as held."""
+    ratio = measured(two_sites(variant, delay_s, acceleration=acceleration), "m")
     law = {**VARIANTS[variant], "acceleration": acceleration, "delay_s": delay_s}
-    assert found == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
-    assert found == pytest.approx(felt, abs=6e-5)
-    assert found == pytest.approx(transmitted(1.0, PAIR, 0, **law), rel=0.02)
+    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
+    assert ratio == pytest.approx(felt, abs=6e-5)
+    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, **law), rel=0.02)
 
 
 @pytest.mark.long
-def test_all_of_the_acceleration_is_unstable_a_tick_late() -> None:
+def test_full_acceleration_one_tick_late_is_unstable() -> None:
     rows = last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
     assert np.abs(rows["qd"]).max() > 100.0
     assert (
@@ -184,7 +189,7 @@ def test_the_linear_loop_has_the_law_without_acceleration() -> None:
     )
 
 
-def test_shares_of_no_single_factor_are_told() -> None:
+def test_shares_without_a_single_factor_are_reported() -> None:
     assert (
         "a = 0.25, weights beta = (0.4375, 0.9375, 0.8125)"
         in describe_law_conditions(three_sites(0.25, 0))[0]
@@ -215,7 +220,9 @@ def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     write_virtual_log(two_sites("without qdd", 0.001, duration_s=26.0), stream)
     responses = compute_log_metrics(opened(stream.getvalue())).responses
     felt = next(
-        one for one in responses if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+        response
+        for response in responses
+        if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
     expected = transmitted(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
         500.0 / (2j * np.pi) + 5.0

@@ -50,7 +50,7 @@ def ends(law: str, starts: tuple[float, ...], gravity: float, *times_s: float) -
 @pytest.mark.parametrize(
     "starts", [(0.6, -0.5), pytest.param((1.0, 0.4), marks=pytest.mark.long), (0.6, -0.5, 0.1)]
 )
-def test_under_gravity_it_ends_at_zero_wherever_it_starts(starts: tuple[float, ...]) -> None:
+def test_under_gravity_any_start_ends_at_zero(starts: tuple[float, ...]) -> None:
     scenario = pendulums("sync", starts, 9.81)
     first, last = (row["q"][:, 0] for row in last_rows(scenario, 20.0, 200.0))
     assert abs(last).max() < 1e-13
@@ -70,7 +70,7 @@ def test_under_gravity_it_ends_at_zero_wherever_it_starts(starts: tuple[float, .
         *(pytest.param(start, marks=pytest.mark.long) for start in HANGING_STARTS),
     ],
 )
-def test_under_gravity_arms_that_start_low_end_hanging(start: tuple[float, float]) -> None:
+def test_under_gravity_low_starts_end_hanging(start: tuple[float, float]) -> None:
     """Y_G'r = 0 also holds where cos q1 = cos(q1 + q2) = 0, whatever r is: arms of two links, no users."""
     names = ("m", "s")
     scenario = unit_scenario(
@@ -103,7 +103,7 @@ OTHER_GAINS: dict[str, tuple[str, dict[str, float], float, tuple[float, float]]]
         ),
     ],
 )
-def test_start_decides_between_hanging_and_zero_for_other_gains(name: str, height: str) -> None:
+def test_other_gains_make_the_start_decide_rest(name: str, height: str) -> None:
     sites, gains, delay_ms, low = OTHER_GAINS[name]
     start = low if height == "low" else (0.8, 0.3)
     share = 1.0 / (len(sites) - 1)
@@ -137,7 +137,7 @@ def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> No
 
 
 @pytest.mark.parametrize("law", ["sync", "adaptive_kinematics"])
-def test_a_law_of_the_planar_arm_refuses_a_chain(law: str) -> None:
+def test_planar_laws_refuse_a_chain(law: str) -> None:
     with pytest.raises(
         ScenarioError, match=f"control.law: {law} uses the regressor of the planar two-link arm"
     ):

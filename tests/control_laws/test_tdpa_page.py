@@ -1,7 +1,7 @@
-"""`tdpa` written once more from docs/data/tdpa-steps.txt, and from nothing else.
+"""`tdpa` written again from docs/data/tdpa-steps.txt, and from nothing else.
 
-Arms, hands and the law are this file's own. The network is an input: which sample was in use at each tick is
-read from the run of the program, which draws delays and losses.
+Arms, hands and the law are this file's own. The network is an input: the sample in use at each
+tick is read from the run of the program, which draws delays and losses.
 """
 
 from dataclasses import dataclass, field
@@ -100,7 +100,7 @@ class Hand(NamedTuple):
 
 
 def advance(arm: Arm, hand: Hand | None, t: float, q: Pair, qd: Pair, tau: Pair) -> Any:
-    """One period under a held torque, classical Runge-Kutta; the hand acts in every stage."""
+    """Advances by one period under a held torque, classical Runge-Kutta; the hand acts in every stage."""
 
     def slope(t: float, q: Pair, qd: Pair) -> tuple[Pair, Pair]:
         pull = hand.torque(t, q, qd) if hand else [0.0, 0.0]
@@ -122,7 +122,7 @@ def advance(arm: Arm, hand: Hand | None, t: float, q: Pair, qd: Pair, tau: Pair)
 
 @dataclass
 class Message:
-    """What a site sends to one peer: its motion and the five numbers of each joint."""
+    """The message of a site to one peer: its motion and the five numbers of each joint."""
 
     q: Pair
     qd: Pair = field(default_factory=lambda: [0.0, 0.0])
@@ -323,7 +323,7 @@ FIRST = next(iter(RUNS))
 
 
 def simulate_page(log: Any, alpha: Any, gains: dict[str, float], ticks: int) -> Any:
-    """Per site q, tau and the energies W_led and W_followed of every tick, by the page."""
+    """Returns per site q, tau and the energies W_led and W_followed of every tick, by the page."""
     names = list(alpha)
     law = {**LAW, **gains}
     peers = {name: [peer for peer in names if peer != name] for name in names}
@@ -374,7 +374,7 @@ def simulate_page(log: Any, alpha: Any, gains: dict[str, float], ticks: int) -> 
     "name",
     [FIRST, *(pytest.param(name, marks=pytest.mark.long) for name in RUNS if name != FIRST)],
 )
-def test_page_alone_gives_the_same_run(name: str) -> None:
+def test_the_page_alone_gives_the_run(name: str) -> None:
     """Positions and energies agree to 1e-9, and torques to 1e-9 of their limit, until chatter begins."""
     alpha, link, gains, chatter = RUNS[name]
     sites = {

@@ -1,4 +1,6 @@
-"""Wave variables on the unit arm: numbers of independent simulations, closed forms, what is not passive."""
+"""Wave variables on the unit arm: numbers of independent simulations, closed forms, and
+non-passive variants.
+"""
 
 import math
 from pathlib import Path
@@ -24,7 +26,7 @@ WAVE = {"law": "wave"}
 
 
 def comparing(reception: str) -> dict[str, Any]:
-    """The class itself, as `hold` is no choice of a scenario."""
+    """Runs the class itself, as no scenario can choose `hold`."""
     none = [0.0, 0.0]
     gains = {
         "b": [b, b],
@@ -52,31 +54,32 @@ def received(
 
 
 def stored(run: dict[str, Any]) -> tuple[Any, Any]:
-    """The energy in the line of joint 1, tick by tick: by its waves, and by the work at its ports.
+    """Returns the energy in the line of joint 1, tick by tick: by its waves, and by the work at
+    its ports.
 
-    What the master's end has on hand counts as put in; its arm gave -tau times its steps.
+    Energy on hand at the master's end counts as input; its arm gave -tau times its steps.
     """
     m, s = run["m"], run["s"]
     u_m, u_s, force_s = m.sent[0].u[:, 0], s.sent[0].u[:, 0], s.tau[:, 0]
     v_m, v_s = (m.tau[:, 0] + b * m.qd[:, 0]) / c, u_s + c / b * force_s
     waves = np.cumsum(0.5 * h * (u_m**2 - v_s**2 + u_s**2 - v_m**2))
-    given = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
+    work = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
     reserve = Wave.reserve_J
     taken = np.cumsum(h * force_s * (c * v_s - force_s) / b)
-    return waves, given + reserve - m.to_all.H[:, 0] - taken
+    return waves, work + reserve - m.to_all.H[:, 0] - taken
 
 
-def test_a_free_slave_comes_to_where_the_master_is() -> None:
+def test_a_free_slave_reaches_its_master() -> None:
     run = ticked(pair(WAVE, clamped=False, duration_s=20.0), every=4)
     m, s = run["m"], run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
     assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
-    apart = np.abs(m.q - s.q)[:, 0].max()  # of qd h at 1 kHz .0476, of continuous time .0477
-    assert apart == pytest.approx(0.0477, rel=4e-3)
+    distance = np.abs(m.q - s.q)[:, 0].max()  # of qd h at 1 kHz .0476, of continuous time .0477
+    assert distance == pytest.approx(0.0477, rel=4e-3)
     assert -m.tau[:, 0].min() == pytest.approx(1.763, rel=2e-3)
 
 
-def test_a_line_stores_what_its_ports_put_in() -> None:
+def test_a_line_stores_the_energy_of_its_ports() -> None:
     waves, ports = stored(ticked(pair(WAVE, clamped=False, duration_s=5.0)))
     assert np.abs(waves - ports).max() < 1e-12 * waves.max()
     assert waves.min() >= 0.0
@@ -84,7 +87,7 @@ def test_a_line_stores_what_its_ports_put_in() -> None:
 
 
 def test_a_clamped_line_is_a_spring() -> None:
-    """Of stiffness b / T, in a row with the follower's K and what clamps it."""
+    """Of stiffness b / T, in series with the follower's K and the clamp."""
     run = ticked(pair(WAVE, clamped=True, duration_s=30.0), every=30000)
     m, s = run["m"], run["s"]
     felt = 1.0 / (T / b + 0.01 + 0.001)
@@ -106,7 +109,9 @@ def test_a_clamped_line_is_a_spring() -> None:
         pytest.param(0.01, 0.0, 4.0004 * 2.0 * math.pi * 0.01, marks=pytest.mark.long),
     ],
 )
-def test_what_a_line_feels_like(frequency_hz: float, clamp_nm_rad: float, ratio: float) -> None:
+def test_a_line_has_its_published_impedance(
+    frequency_hz: float, clamp_nm_rad: float, ratio: float
+) -> None:
     """|torque / velocity| at the master, N m s/rad: of a free slave the masses and b T."""
     periods = 3 if frequency_hz < 0.1 else 6
     push = {"kind": "multisine", "amplitude_nm": [0.2, 0.1], "frequencies_hz": [frequency_hz]}
@@ -121,29 +126,25 @@ def test_what_a_line_feels_like(frequency_hz: float, clamp_nm_rad: float, ratio:
 @pytest.mark.parametrize(
     ("reception", "end"), [("hold", 0.4214), ("zero", 0.1496), ("replay", 0.3)]
 )
-def test_an_outage_leaves_an_offset_only_where_waves_are_held(
-    reception: str, end: float
-) -> None:
+def test_outages_leave_offsets_only_with_held_waves(reception: str, end: float) -> None:
     slave = ticked(received(reception, CUT), every=20000)["s"]
     assert slave.q[-1, 0] == pytest.approx(end, rel=2e-3)
 
 
 def varying(period_s: float = 2.0) -> dict[str, Any]:
-    """T(t) = 0.2 + 0.15 sin(pi t) at the time t of receipt, as a trace by stamps."""
+    """Returns T(t) = 0.2 + 0.15 sin(pi t) at the time t of receipt, as a trace by stamps."""
     t = np.arange(0.0, 12.0, 1e-3)
     sent = t - 0.2 - 0.15 * np.sin(2.0 * np.pi * t / period_s)
     stamps = np.arange(0.0, 10.0, 1e-3)
     delays = np.interp(stamps, sent, t) - stamps
-    points = ", ".join(f"{n * 1000} {round(1e6 * one)}" for n, one in enumerate(delays))
+    points = ", ".join(f"{n * 1000} {round(1e6 * delay)}" for n, delay in enumerate(delays))
     return {"model": "trace", "trace": points}
 
 
 @pytest.mark.parametrize(
     ("reception", "least"), [("hold", -0.3345), ("scaled", 0.0), ("replay", 0.0)]
 )
-def test_delay_that_varies_makes_energy_of_waves_that_are_held(
-    reception: str, least: float
-) -> None:
+def test_varying_delay_makes_energy_from_held_waves(reception: str, least: float) -> None:
     push = {**hand(0.3, damping=0.0), "move_end_s": 1.5}
     env = [{**CLAMP, "stiffness_nm_rad": 200.0}]
     waves, _ = stored(ticked(received(reception, varying(), 4.0, env, push)))
@@ -160,13 +161,13 @@ LOSSY = [
 
 
 def held_torque(link: dict[str, Any], push: dict[str, Any], duration_s: float) -> Any:
-    """The master's torque, a row a tick, in contact with 700 N m/rad and 3 N m s/rad."""
+    """Returns the master's torque, a row a tick, in contact with 700 N m/rad and 3 N m s/rad."""
     clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
     return ticked(received("replay", link, duration_s, [clamp], push))["m"].tau[:, 0]
 
 
 @pytest.mark.parametrize(("link", "duration_s"), LOSSY)
-def test_line_under_constant_force_plays_it_at_ticks_without_wave(
+def test_constant_force_plays_at_ticks_without_wave(
     link: dict[str, Any], duration_s: float
 ) -> None:
     push = {"kind": "recorded", "points": [[0.0, 2.2, 1.1], [1e4, 2.2, 1.1]]}
@@ -176,7 +177,7 @@ def test_line_under_constant_force_plays_it_at_ticks_without_wave(
 
 
 @pytest.mark.parametrize(("link", "duration_s"), LOSSY)
-def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: float) -> None:
+def test_contact_under_loss_keeps_its_force(link: dict[str, Any], duration_s: float) -> None:
     tau = np.abs(held_torque(link, hand(0.0682, 40.0, 6.0), duration_s))
     assert tau[-1000:].mean() == pytest.approx(tau[9000:10000].mean(), rel=1e-3)
     assert np.abs(np.diff(tau[10000:])).max() < 0.03
@@ -193,7 +194,7 @@ def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: fl
     ],
 )
 def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
-    """Where delays vary and nothing damps: two ends, two joints, a reserve in H and one in W."""
+    """Under varying delays without damping: two ends, two joints, a reserve in H and one in W."""
     control = {"law": "wave", "K": 0.0, "B": 0.0, "reserve_J": reserve_J}
     sites = {"m": {"qd0_rad_s": [1e-6, 5e-7]}, "s": {}}
     run = ticked(unit_scenario(sites, control, duration_s=20.0, link=link))
@@ -220,7 +221,7 @@ SHARES = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 
 
 
 @pytest.mark.long
-def test_three_sites_are_the_network_of_springs_b_over_T() -> None:
+def test_three_sites_are_springs_b_over_t() -> None:
     law = {"law": "wave", "lines": MESH}
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
     scenario = unit_scenario(sites, law, duration_s=40.0, dominance=SHARES)
@@ -234,8 +235,8 @@ def test_three_sites_are_the_network_of_springs_b_over_T() -> None:
 
 
 @pytest.mark.long
-def test_weights_say_who_feels_whom() -> None:
-    """Torques of lines add to zero; beta divides what each site gets of them.
+def test_weights_share_the_felt_torques() -> None:
+    """Torques of lines add to zero; beta divides the torque of each site.
 
     Nothing but the hand damps: with waves of qd h this loop diverges from 60 s on.
     """
@@ -254,7 +255,7 @@ def test_weights_say_who_feels_whom() -> None:
     assert min(float(site.to_all.H.min()) for site in run.values()) >= -1e-9
 
 
-def test_law_of_ones_own_is_same_to_last_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_law_gives_the_same_last_digits(monkeypatch: pytest.MonkeyPatch) -> None:
     """examples/wave_law.py."""
     monkeypatch.chdir(Path(__file__).parents[2] / "examples")
     ours, theirs = (
@@ -270,7 +271,7 @@ def test_law_of_ones_own_is_same_to_last_digits(monkeypatch: pytest.MonkeyPatch)
         assert np.abs(ours.stack(field) - theirs.stack(field)).max() < 1e-12
 
 
-def test_all_sites_are_ends_of_lines_at_one_rate() -> None:
+def test_line_ends_share_one_rate() -> None:
     with pytest.raises(ScenarioError, match="all sites"):
         unit_scenario({"m": {"control": WAVE}, "s": {"control": {"law": "p_d"}}}, WAVE)
     with pytest.raises(ScenarioError, match="the same at all sites"):

@@ -1,6 +1,7 @@
-"""Chains with their dynamics as Pinocchio computed them, `chain_references.json`, and as our leaves do.
+"""Chains with their dynamics as computed by Pinocchio (`chain_references.json`) and by the
+leaves of the core.
 
-`make_chain_references.py` makes the file anew; to read it, nothing but the file is needed.
+`make_chain_references.py` writes the file; reading needs nothing but the file.
 """
 
 import functools
@@ -29,9 +30,9 @@ ARMS = Path(trilat_net.__file__).with_name("scenarios")
 
 
 class ChainState(NamedTuple):
-    """What a chain is asked in one state, and the answers; frames and units of `UrdfJoint`.
+    """The state of a chain with Pinocchio's results; frames and units of `UrdfJoint`.
 
-    Velocity terms are the Christoffel ones, which make Mdot - 2C skew.
+    Velocity terms use Christoffel symbols, so that Mdot - 2C is skew.
     """
 
     gravity: Array
@@ -66,7 +67,7 @@ class ChainReference(NamedTuple):
 
 @functools.cache
 def chain_references() -> dict[str, ChainReference]:
-    """Chains by name: random1, random2, random3, arm6, arm7, random12."""
+    """Returns chains by name: random1, random2, random3, arm6, arm7, random12."""
     return {
         name: ChainReference(
             to_chain(entry),
@@ -80,7 +81,7 @@ def chain_references() -> dict[str, ChainReference]:
 
 
 def to_chain(entry: dict) -> UrdfChain:
-    """A chain from plain numbers, without limits and friction."""
+    """Returns a chain from plain numbers, without limits and friction."""
     joints = [
         UrdfJoint(
             joint["name"],
@@ -116,14 +117,14 @@ def moving(arm: Arm, state: ChainState, v: Array) -> None:
 
 
 def torque_for(arm: Arm, v: Array, a: Array) -> Array:
-    """The torque of inverse dynamics for v and a."""
+    """Returns the torque of inverse dynamics for v and a."""
     torque = np.zeros(len(arm.rows))
     inverse_dynamics(arm.rows, arm.theta, v, a, torque)
     return torque
 
 
 def full_matrix(arm: Arm) -> Array:
-    """M, of which the leaf fills the lower half."""
+    """Returns M; the leaf fills only its lower half."""
     mass_matrix(arm.rows, arm.theta)
     n = len(arm.rows)
     lower = np.tril(arm.rows["M"][:, :n])

@@ -1,4 +1,4 @@
-"""Channels by themselves: the fates of a link's samples as an array."""
+"""Channels alone: the fates of a link's samples as an array."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ def channel(
     outages: int = 0,
     pages: int = _BLOCK,
 ) -> Channel:
-    """A channel at its beginning; of the points the last `outages` are such."""
+    """Returns a channel at its beginning; the last `outages` of its points are outages."""
     table = np.empty((0, 2), dtype=np.int64) if points is None else points
     row: Any = np.zeros(1, link_dtype(2))[0]
     row.rate_hz, row.key, row.models = rate_hz, link_key(seed, name), len(models)
@@ -53,7 +53,7 @@ def channel(
 
 
 def due(made: Channel, count: int) -> Ints:
-    """When the next samples up to `count` are due, ns, or LOST; shape (count,) from a fresh channel."""
+    """Returns when the samples up to `count` are due, ns, or LOST; shape (count,) from a fresh channel."""
     row, models, dues, points = made
     first = int(row.scheduled) + 1
     parts = []
@@ -69,7 +69,7 @@ def stamps(count: int, rate_hz: int = 1000) -> Ints:
 
 
 def delays_us(link: LinkBase, seed: int, count: int) -> Ints:
-    """The delays that a link gives to its first samples, us; none may be lost."""
+    """Returns the delays of a link's first samples, us; none may be lost."""
     points = link.points
     model = link.to_core_model()._replace(trace_count=0 if points is None else len(points))
     ns = due(channel([model], seed, points=points), count) - stamps(count)

@@ -1,12 +1,12 @@
-"""Programs that print what they compute, with the compiler and without it."""
+"""Programs that print their results, with the compiler and without it."""
 
 import os
 import subprocess
 import sys
 
 
-def printed(program: str, *, compiled: bool) -> str:
-    """What a program prints in a process of its own."""
+def run_program(program: str, *, compiled: bool) -> str:
+    """Returns the output of a program in a process of its own."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if compiled else "1"}
     command = [sys.executable, "-c", program]
     return subprocess.run(

@@ -1,4 +1,4 @@
-"""Two arms under the rule `glide`: their limits, orders at ticks, and what a log says of them."""
+"""Two arms under the rule `glide`: their limits, orders at ticks, and the reasons in a log."""
 
 import functools
 import io
@@ -11,8 +11,8 @@ from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.messages import RESTING_MODES
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.code_consent import allow_own_code
 from trilat_net.scenario.run_changes import make_site_order, to_core_change
 
 TEXT = """
@@ -59,7 +59,7 @@ KEYS = {"duration_s": 6.0, "rate_hz": 1000, "outages_s": "[]", "speed": 1.0, "li
 
 
 def adaptive_text() -> str:
-    """The scenario of the rule, with the paper's law."""
+    """Returns the scenario of the rule, with the paper's law."""
     text = TEXT.replace(
         "K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0"
     )
@@ -69,18 +69,18 @@ def adaptive_text() -> str:
 def guarded(
     limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object
 ) -> Scenario:
-    """The scenario of the rule, with limits of all sites or of one."""
+    """Returns the scenario of the rule, with limits of all sites or of one."""
     overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
     return allow_own_code(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
 
 
 def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:
-    """A virtual run in which sites are given orders at ticks."""
+    """Returns a virtual run in which sites are given orders at ticks."""
 
     def change(site: str, tick: int, order: str) -> CoreChange:
         t_ns = tick_ns(tick, scenario.sites[site].rate_hz)
-        made = make_site_order(scenario, site, order, t_ns, ticks)
-        return to_core_change(scenario, made)
+        order_change = make_site_order(scenario, site, order, t_ns, ticks)
+        return to_core_change(scenario, order_change)
 
     commands = {
         site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
@@ -93,25 +93,26 @@ def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 
 
 
 def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
-    """The modes of a site, each with its reason, as they followed each other."""
-    found: list[tuple[str, LifeReason]] = []
+    """Returns the modes of a site in order, each with its reason."""
+    modes: list[tuple[str, LifeReason]] = []
     for state in log[site].states:
         reason = find_life_reason(read_output(state, log[site].peers))
-        if not found or found[-1] != (state.mode, reason):
-            found.append((state.mode, reason))
-    return found
+        if not modes or modes[-1] != (state.mode, reason):
+            modes.append((state.mode, reason))
+    return modes
 
 
 @functools.cache
 def stopped_log(text: str = TEXT, enabled: int = 3500) -> Log:
-    """The slave is stopped at 2 s, while it moves, and enabled at a tick."""
+    """Returns the log of a slave that is stopped at 2 s, while it moves, and enabled at a tick."""
     return ordered(guarded(text=text), {"s": {2000: "stop", enabled: "enable"}})
 
 
 def largest_step(log: Log, site: str, first: int = 0) -> float:
-    """The largest change of the torque of a joint from tick to tick; before tick 0 there is none.
+    """Returns the largest change of a joint's torque between ticks; the torque before tick 0 is
+    zero.
 
-    Less what brakes an arm that comes to rest, B |qd| against its motion.
+    The braking torque of an arm that comes to rest, B |qd| against its motion, is subtracted.
     """
     part = log[site]
     steps = np.diff(np.vstack([np.zeros_like(part.tau[:1]), part.tau]), axis=0)

@@ -128,7 +128,7 @@ def make_scenario(number: int, rate_nm_s: float) -> Scenario:
 
 @lru_cache(maxsize=len(CASES))
 def make_run(number: int) -> Log:
-    """A run of a case, from which stops of any rate of the torque begin."""
+    """Returns a run of a case, from which stops of any rate of the torque begin."""
     return trilat_net.simulate(make_scenario(number, RATES_NM_S[1]))
 
 
@@ -140,7 +140,7 @@ def state_bound(number: int, rate_nm_s: float, site: str) -> float:
 def draw_state(
     log: Log, site: str, rng: np.random.Generator, *, synthetic: bool, too_fast: bool
 ) -> tuple[TickRecord, TickRecord]:
-    """Two records in a row from which a site stops, of one that follows its peers."""
+    """Draws two successive records of a site that follows its peers; a stop starts from these."""
     part, scenario = log[site], log.scenario
     follows = np.isin(part.mode, ("return", "run"))
     rows = np.flatnonzero(follows[1:] & follows[:-1]) + 1
@@ -168,7 +168,7 @@ def draw_state(
 def run_stop(
     scenario: Scenario, site: str, before: TickRecord, last: TickRecord
 ) -> list[TickRecord]:
-    """The records of a stop until the arm has been at rest for 0.3 s."""
+    """Returns the records of a stop until the arm has been at rest for 0.3 s."""
     moving = Site(scenario.setup(site))
     moving.restore_state(before, last)
     rate_hz = scenario.sites[site].rate_hz
@@ -230,7 +230,7 @@ def measure_stop(
 
 
 def draw_stops(seed: int, count: int, *, faults: bool = False) -> Iterator[Stop]:
-    """Stops, or faults, of all cases in turn."""
+    """Yields stops, or faults, of all cases in turn."""
     for n in range(count):
         rng = np.random.default_rng((seed, n, int(faults)))
         number = n % len(CASES)

@@ -1,4 +1,4 @@
-"""A channel of every kind, and what it does to samples."""
+"""A channel of every kind, and its effect on samples."""
 
 import numpy as np
 

@@ -17,7 +17,7 @@ SEED = 14
 
 
 def build_model(chain: UrdfChain) -> pin.Model:
-    """A chain as a model of Pinocchio, with its end link as the last frame."""
+    """Returns a chain as a model of Pinocchio, with its end link as the last frame."""
     model = pin.Model()
     at = 0
     for joint in chain.joints:
@@ -40,7 +40,9 @@ def parameters(chain: UrdfChain) -> Array:
 
 
 def regressor(model: pin.Model, q: Array, qd: Array, v: Array, a: Array) -> Array:
-    """Y(q, qd, v, a) of two velocities from the one of one, by polarisation of its quadratic term."""
+    """Returns Y(q, qd, v, a) of two velocities from the regressor of one, by polarisation of
+    its quadratic term.
+    """
     still = np.zeros(model.nv)
 
     def Y(qd: Array, a: Array) -> Array:
@@ -51,7 +53,7 @@ def regressor(model: pin.Model, q: Array, qd: Array, v: Array, a: Array) -> Arra
 
 
 def answer(model: pin.Model, chain: UrdfChain, state: dict[str, Array]) -> dict[str, Array]:
-    """What Pinocchio says of a state."""
+    """Returns Pinocchio's results for a state."""
     model.gravity.linear = state["gravity"]
     data = model.createData()
     q, qd, tip = state["q"], state["qd"], model.nframes - 1
@@ -77,7 +79,7 @@ def random_rotation(random: np.random.Generator) -> Array:
 
 
 def random_body(random: np.random.Generator) -> Array:
-    """Ten parameters of eight point masses: physical, whatever is drawn."""
+    """Returns ten parameters of eight point masses, which are physical for any draw."""
     masses, places = (
         random.uniform(0.05, 0.5, 8),
         random.normal(0.0, 0.15, (8, 3)) + random.normal(0.0, 0.2, 3),
@@ -90,7 +92,7 @@ def random_body(random: np.random.Generator) -> Array:
 
 
 def random_chain(random: np.random.Generator, n: int, sliders: tuple[int, ...] = ()) -> dict:
-    """A chain of plain numbers, with axes in any direction."""
+    """Returns a chain of plain numbers, with axes in any direction."""
     joints = []
     for i in range(n):
         axis = random.normal(size=3)
@@ -123,7 +125,7 @@ def shipped_chain(name: str) -> dict:
 
 
 def random_state(random: np.random.Generator, n: int, weight: bool) -> dict[str, Array]:
-    """A state; its gravity points down, or anywhere."""
+    """Returns a state; its gravity points down, or anywhere."""
     gravity = np.array([0.0, 0.0, -9.81]) if weight else random.normal(0.0, 6.0, 3)
     spread = {"q": 1.5, "qd": 2.0, "v": 1.0, "a": 3.0, "tau": 5.0}
     drawn = {key: random.normal(0.0, size, n) for key, size in spread.items()}
@@ -148,12 +150,13 @@ def main() -> None:
             state = random_state(random, model.nv, weight=i == 0)
             whole = state | answer(model, chain, state)
             entry["states"].append({key: value.tolist() for key, value in whole.items()})
-    made = {
+    references = {
         "source": f"Pinocchio {pin.__version__}, tests/core/make_chain_references.py",
         "chains": chains,
     }
     PATH.write_text(
-        json.dumps(made, separators=(",", ":")).replace('},{"gravity"', '},\n{"gravity"') + "\n"
+        json.dumps(references, separators=(",", ":")).replace('},{"gravity"', '},\n{"gravity"')
+        + "\n"
     )
 
 

@@ -1,4 +1,4 @@
-"""Tables of draws, and the generator once more, in integers."""
+"""Tables of draws, and the generator written again in integers."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ U32 = 2**32 - 1
 
 
 def philox_in_integers(counter: tuple[int, ...], key: tuple[int, int]) -> list[int]:
-    """The paper's definition, in Python's own integers."""
+    """Computes Philox by the definition of the paper, in Python's own integers."""
     c, k = list(counter), list(key)
     for _ in range(10):
         a, b = 0xD2511F53 * c[0], 0xCD9E8D57 * c[2]

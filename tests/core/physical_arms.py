@@ -1,6 +1,7 @@
-"""Physical arms drawn at random, and their dynamics derived again: from where the masses are.
+"""Physical arms drawn at random, and their dynamics derived again from the positions of the
+masses.
 
-Nothing of `trilat_net.core.arm` is in here but the type that names lengths and masses.
+The only import from `trilat_net.core.arm` is the type that names lengths and masses.
 """
 
 import numpy as np
@@ -36,15 +37,15 @@ STEP = 1e-30
 
 
 def centres(a: ArmLinks, q: NDArray) -> list[NDArray]:
-    """Where the centres of mass are, in the vertical plane; q may be complex."""
+    """Returns the centres of mass, in the vertical plane; q may be complex."""
     first, both = q[0], q[0] + q[1]
     elbow = a.l1_m * np.array([np.cos(first), np.sin(first)])
-    one = a.lc1_m * np.array([np.cos(first), np.sin(first)])
-    return [one, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
+    first_centre = a.lc1_m * np.array([np.cos(first), np.sin(first)])
+    return [first_centre, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
 
 
 def kinetic(a: ArmLinks, q: Array, qd: Array) -> float:
-    """Energy of the moving masses; their velocities by complex step along qd."""
+    """Returns the energy of the moving masses; their velocities by complex step along qd."""
     one, two = (centre.imag / STEP for centre in centres(a, q + 1j * STEP * qd))
     spin = a.I1_kg_m2 * qd[0] ** 2 + a.I2_kg_m2 * (qd[0] + qd[1]) ** 2
     return float(0.5 * (a.m1_kg * one @ one + a.m2_kg * two @ two + spin))
@@ -56,12 +57,12 @@ def potential(a: ArmLinks, g: float, q: NDArray) -> NDArray:
 
 
 def gravity(a: ArmLinks, g: float, q: Array) -> Array:
-    """The gradient of the potential energy, by complex step."""
+    """Returns the gradient of the potential energy, by complex step."""
     return np.array([potential(a, g, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)])
 
 
 def inertia(a: ArmLinks, q: NDArray) -> NDArray:
-    """Sum of m J'J and I, with the Jacobians of the centres of mass; q may be complex."""
+    """Returns the sum of m J'J and I, with the Jacobians of the centres of mass; q may be complex."""
     s1, c1 = np.sin(q[0]), np.cos(q[0])
     s12, c12 = np.sin(q[0] + q[1]), np.cos(q[0] + q[1])
     J1 = a.lc1_m * np.array([[-s1, 0 * s1], [c1, 0 * s1]])
@@ -76,14 +77,14 @@ def inertia(a: ArmLinks, q: NDArray) -> NDArray:
 
 
 def inertia_rates(a: ArmLinks, q: Array) -> Array:
-    """dM/dq_k, shape (2, 2, 2) with k last, by complex step."""
+    """Returns dM/dq_k, shape (2, 2, 2) with k last, by complex step."""
     return np.stack(
         [inertia(a, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)], axis=-1
     )
 
 
 def coriolis(a: ArmLinks, q: Array, qd: Array) -> Array:
-    """C(q, qd) by Christoffel symbols of the first kind."""
+    """Returns C(q, qd) by Christoffel symbols of the first kind."""
     D = inertia_rates(a, q)
     symbols = 0.5 * (D + D.transpose(0, 2, 1) - D.transpose(2, 0, 1))
     return np.einsum("ijk,k->ij", symbols, qd)

@@ -1,4 +1,4 @@
-"""The equations of `resting` over the rows of a log, written once more."""
+"""The equations of `resting` over the rows of a log, written again."""
 
 import numpy as np
 
@@ -9,13 +9,14 @@ from trilat_net.log.site_log import SiteLog
 
 
 def gravity_of(theta: Array, q: Array) -> Array:
-    """G of the planar arm, rows of q, by the paper's Eq. (2)."""
+    """Returns G of the planar arm, rows of q, by the paper's Eq. (2)."""
     outer = theta[4] * np.cos(q[:, 0] + q[:, 1])
     return 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
 
 
 def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
-    """q_ref and qd_ref of an arm that comes to rest from its record `first` on, with no torque at its limit.
+    """Returns q_ref and qd_ref of an arm that comes to rest from record `first` on, with no
+    torque at its limit.
 
     Eq. (1) of docs/theory/coming-to-rest.md, joint by joint; q_ref is the integral of qd_ref.
     """
@@ -26,9 +27,9 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
             LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max())
         )
         share = 1.0 - h_s / left_s if left_s > h_s + 1e-9 else 0.0
-        own = part.qd[first + n]
-        slower = np.copysign(np.minimum(np.abs(share * qd_ref[-1]), np.abs(own)), own)
-        rate = np.where(qd_ref[-1] * own > 0.0, slower, 0.0) * (share > 0.0)
+        speed = part.qd[first + n]
+        slower = np.copysign(np.minimum(np.abs(share * qd_ref[-1]), np.abs(speed)), speed)
+        rate = np.where(qd_ref[-1] * speed > 0.0, slower, 0.0) * (share > 0.0)
         q_ref.append(q_ref[-1] + 0.5 * h_s * (qd_ref[-1] + rate))
         qd_ref.append(rate)
     return np.array(q_ref), np.array(qd_ref)
@@ -37,9 +38,10 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
 def rest_torque(
     gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array
 ) -> tuple[Array, Array]:
-    """Law + w - B s from a record on, and w, of a slow arm whose law does not learn.
+    """Returns law + w - B s from a record on, and w, of a slow arm whose law does not learn.
 
-    Eq. (2) to (4) of docs/theory/coming-to-rest.md, for rows of its law's torque; w is that with which a tick begins.
+    Eq. (2) to (4) of docs/theory/coming-to-rest.md, for rows of its law's torque; w is the
+    value at the start of a tick.
     """
     rows = slice(first, first + len(law))
     q_ref, qd_ref = reference(gains, part, first, len(law))
@@ -59,7 +61,7 @@ def rest_torque(
 
 
 def integrals(part: SiteLog, rows: slice) -> Array:
-    """w of the records after some: what their `mem` has of the torque at rest."""
+    """Returns w of the records after a given one, read from the torque at rest in `mem`."""
     first = 2 * (part.layout.shared + 1) + len(part.peers)
     return np.array(
         [

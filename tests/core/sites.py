@@ -17,14 +17,14 @@ VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 
 
 def setup(site: str = "m1", scenario: str = "paper", **overrides: Any) -> SiteSetup:
-    """The setup of a site; overrides with `__` for the dot."""
+    """Returns the setup of a site; overrides with `__` for the dot."""
     return load_scenario(
         scenario, {key.replace("__", "."): value for key, value in overrides.items()}
     ).setup(site)
 
 
 def one_link(rate_hz: int, peer_rate_hz: int, delay_ns: int) -> Site:
-    """A site with a single peer behind a constant delay; its reference therefore is the sample in use."""
+    """Returns a site with a single peer behind a constant delay, whose reference is the sample in use."""
     return linked(rate_hz, peer_rate_hz, [LinkModel(location=delay_ns / 1000)])
 
 
@@ -35,7 +35,7 @@ def linked(
     trace: Points | None = None,
     outages: tuple[tuple[int, int], ...] = (),
 ) -> Site:
-    """A site with a single peer behind any link, by the name and seed of `channels.channel`."""
+    """Returns a site with a single peer behind any link, by the name and seed of `channels.channel`."""
     key, traces = link_key(1, LINK_NAME), (trace,) * len(models)
     link = LinkSetup(
         "peer", 1.0, peer_rate_hz, (0.5, -0.25), key, tuple(models), traces, outages
@@ -44,7 +44,7 @@ def linked(
 
 
 def sample(tick: int, peer: int = 0) -> Arrival:
-    """A sample that carries its own number."""
+    """Returns a sample that carries its own number."""
     return Arrival(peer, tick, (1e-3 * (tick + 1), -1e-3 * (tick + 1)), (1e-4 * tick, 0.0))
 
 
@@ -53,14 +53,14 @@ def stepped(site: Site, ticks: Iterable[TickInput]) -> list[TickRecord]:
 
 
 def bits(output: TickRecord) -> str:
-    """All that a step computes of a tick, exactly, as text."""
+    """Returns all results of a tick, exactly, as text."""
     return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(
         output[-2:]
     )
 
 
 def executed(scenario: str, **overrides: object) -> list[str]:
-    """A virtual run, every record as text."""
+    """Returns a virtual run, every record as text."""
     run = virtual.execute_virtual(
         load_scenario(scenario, {k.replace("__", "."): v for k, v in overrides.items()})
     )

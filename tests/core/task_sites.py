@@ -1,4 +1,4 @@
-"""A site whose arm of seven joints follows in task space: its arrays."""
+"""The arrays of a site whose arm of seven joints follows in task space."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ PLACE, POSE = TaskSetup((1.0,) * 3, 0.5), TaskSetup((1.0,) * 6, 1.0, posture_rat
 
 
 def build(task: TaskSetup) -> SiteArrays:
-    """The arrays of the site with a task."""
+    """Returns the arrays of the site with a task."""
     joints = tuple(
         ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m)
         for one in CHAIN.joints

@@ -1,4 +1,4 @@
-"""Samples in any order behind any link: the same fates, the newest wins, everything is counted."""
+"""Samples in any order behind any link: equal fates, the newest is in use, and every sample is counted."""
 
 from collections.abc import Sequence
 
@@ -36,11 +36,13 @@ def behind(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
 
 
 def releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
-    """The first tick of the receiver that may use each sample, or LOST, from a channel by itself."""
-    made = due(channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count).tolist()
+    """Returns the first tick of the receiver that may use each sample, or LOST, from a channel alone."""
+    release_times = due(
+        channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count
+    ).tolist()
     return [
         LOST if ns == LOST else first_tick_at(max(ns, tick_ns(m, peer_rate_hz) + 1), rate_hz)
-        for m, ns in enumerate(made)
+        for m, ns in enumerate(release_times)
     ]
 
 
@@ -50,19 +52,19 @@ arrivals = st.lists(st.lists(st.integers(0, 250), max_size=8), min_size=1, max_s
 @every_kind
 @quick
 @given(came=arrivals, rates=st.sampled_from([(1000, 1000), (1000, 333), (700, 1000)]))
-def test_in_use_is_the_newest_due_sample_that_arrived(
+def test_the_newest_due_arrived_sample_is_used(
     name: str, came: list[list[int]], rates: tuple[int, int]
 ) -> None:
     """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
     release = releases(name, 251, *rates)
     site = behind(name, *rates)
-    there: set[int] = set()
+    arrived: set[int] = set()
     before = -1
     for k in range(TICKS):
         now = came[k] if k < len(came) else []
-        there.update(now)
+        arrived.update(now)
         output = site.step(TickInput(k, [sample(m) for m in now]))
-        assert output.used == [max((m for m in there if LOST < release[m] <= k), default=-1)]
+        assert output.used == [max((m for m in arrived if LOST < release[m] <= k), default=-1)]
         assert output.used[0] >= before
         before = output.used[0]
         if before >= 0:
@@ -76,7 +78,7 @@ def test_in_use_is_the_newest_due_sample_that_arrived(
 @quick
 @given(came=arrivals)
 def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> None:
-    """Accepted = refused + duplicate + lost + superseded + used, once none waits any more."""
+    """Accepted = refused + duplicate + lost + superseded + used, once no sample waits any more."""
     site = behind(name)
     release = releases(name, 251, 1000, 1000)
     used: set[int] = set()
@@ -92,7 +94,7 @@ def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> Non
 
 
 def first_arrivals(came: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
-    """(tick of the receiver, sample) without repetitions."""
+    """Returns (tick of the receiver, sample) without repetitions."""
     seen: dict[int, int] = {}
     for k, now in enumerate(came):
         for m in now:
@@ -111,7 +113,7 @@ def first_arrivals(came: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
 def test_the_order_of_arrival_changes_no_bit(
     name: str, order: list[int], at: list[int], twice: set[int], peer_rate_hz: int
 ) -> None:
-    """Samples that come before they are due, in any order, some twice, one batch or many."""
+    """Samples that come before they are due, in any order, some twice, in one batch or many."""
 
     def run_with(schedule: dict[int, list[int]]) -> list[TickRecord]:
         ticks = [TickInput(k, [sample(m) for m in schedule.get(k, [])]) for k in range(450)]
@@ -128,8 +130,10 @@ def test_the_order_of_arrival_changes_no_bit(
 
 @every_kind
 @pytest.mark.parametrize("k", [1, 40, 333])
-def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> None:
-    """Fresh or used for something else before: what a channel remembers follows from the beginning."""
+def test_reused_sites_have_the_same_future(name: str, k: int) -> None:
+    """A fresh site, or one used for something else before: the memory of a channel follows from
+    the beginning.
+    """
     ticks = [TickInput(n, [sample(n - 1)] if n else []) for n in range(TICKS)]
     whole = stepped(behind(name), ticks)
     before, last = whole[max(0, k - 2)], whole[k - 1]
@@ -145,7 +149,7 @@ def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> N
 
 @every_kind
 def test_a_long_silence_changes_nothing_afterwards(name: str) -> None:
-    """The channel goes on by index while nothing comes."""
+    """The channel advances by index while no sample comes."""
     silent = stepped(
         behind(name), [TickInput(k, [sample(k - 1)] if k > 600 else []) for k in range(900)]
     )
@@ -168,10 +172,8 @@ hostile = st.one_of(
 @every_kind
 @quick
 @given(came=st.lists(st.lists(hostile, max_size=5), max_size=6))
-def test_whatever_number_a_sample_claims_the_work_is_bounded(
-    name: str, came: list[list[int]]
-) -> None:
-    """A channel looks no further ahead than ten seconds, and nobody else's samples suffer."""
+def test_work_is_bounded_for_any_sample_number(name: str, came: list[list[int]]) -> None:
+    """A channel looks no further ahead than ten seconds, and no other peer's samples suffer."""
     site = behind(name)
     for k, now in enumerate(came):
         output = site.step(TickInput(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
@@ -187,7 +189,7 @@ def test_whatever_number_a_sample_claims_the_work_is_bounded(
 
 @pytest.mark.parametrize("name", ["constant", "uniform", "measured", "in order"])
 def test_an_ancient_sample_counts_as_lost(name: str) -> None:
-    """Its page has been turned; at 1 Hz there are 32 of them."""
+    """The page of the calendar has been reused; at 1 Hz there are 32 pages."""
     site = behind(name, 1, 1)
     stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(60)])
     before = site.counts()[0]
@@ -202,8 +204,8 @@ def test_an_ancient_sample_counts_as_lost(name: str) -> None:
 # Single kinds.
 
 
-def test_newest_wins_shortens_the_age_and_in_order_lengthens_it() -> None:
-    """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 and more."""
+def test_newest_first_shortens_ages_unlike_order() -> None:
+    """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 ms and more."""
 
     def mean_age(in_order: int) -> float:
         model = LinkModel(
@@ -223,10 +225,10 @@ def test_newest_wins_shortens_the_age_and_in_order_lengthens_it() -> None:
     came=st.lists(st.integers(0, 30), min_size=30, max_size=30),
     rates=st.sampled_from([(1000, 1000), (400, 900)]),
 )
-def test_a_measured_sample_is_in_use_from_its_arrival(
+def test_measured_samples_are_used_from_arrival(
     came: list[int], rates: tuple[int, int]
 ) -> None:
-    """But not at its own stamp: one that comes from ahead waits for the first tick behind it."""
+    """But not at their own stamp: a sample from a clock that is ahead waits for the first later tick."""
     site = linked(*rates, [LinkModel(kind=DelayKind.MEASURED)])
     for k in range(80):
         now = [m for m, at in enumerate(came) if at == k]
@@ -242,7 +244,7 @@ def test_a_measured_sample_is_in_use_from_its_arrival(
     assert site.is_measured(0)
 
 
-def test_measured_link_may_have_play_out_buffer_of_its_own() -> None:
+def test_measured_links_may_have_play_out_buffers() -> None:
     """Real jitter below the budget becomes a constant delay."""
     site = linked(1000, 1000, [LinkModel(kind=DelayKind.MEASURED, playout_us=20_000)])
     jitter = [1, 7, 3, 19, 12, 5, 20, 2]
@@ -255,7 +257,7 @@ def test_measured_link_may_have_play_out_buffer_of_its_own() -> None:
     assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
 
 
-def test_copy_with_earlier_delay_makes_its_sample_due_earlier() -> None:
+def test_copies_with_earlier_delay_make_samples_earlier() -> None:
     alone, twice = (
         linked(1000, 1000, [KINDS["copies"]._replace(duplicate=p)]) for p in (0.0, 1.0)
     )
@@ -265,7 +267,7 @@ def test_copy_with_earlier_delay_makes_its_sample_due_earlier() -> None:
     assert (twice.counts()[0].copies, alone.counts()[0].copies) == (300, 0)
 
 
-def test_a_link_that_is_cut_ages_and_heals() -> None:
+def test_a_cut_link_ages_and_heals() -> None:
     """`used` stands still, never decreases, and is back to nominal with the first fresh sample."""
     model = LinkModel(location=20_000.0)
     site = linked(1000, 1000, [model], outages=((100 * 10**6, 200 * 10**6),))
@@ -282,7 +284,7 @@ def test_a_link_that_is_cut_ages_and_heals() -> None:
 # Changes of a link while it runs.
 
 
-def test_a_command_holds_for_samples_stamped_from_then_on() -> None:
+def test_commands_hold_for_later_stamps_only() -> None:
     site = linked(1000, 1000, [LinkModel(location=5_000.0)])
     change = CoreChange("slower", 0, LinkModel(from_ns=30_000_000, location=20_000.0))
     used = []

@@ -23,14 +23,18 @@ each = pytest.mark.parametrize("name", REFERENCES)
 
 def build(name: str, **drive: float) -> Arm:
     joints = REFERENCES[name].chain.joints
-    made = [
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
-        for one in joints
+    fields = [
+        ChainJoint(
+            joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
+        )
+        for joint in joints
     ]
-    return Arm(build_chain(made, MAX_JOINTS), np.concatenate([one.inertia for one in joints]))
+    return Arm(
+        build_chain(fields, MAX_JOINTS), np.concatenate([joint.inertia for joint in joints])
+    )
 
 
-def apart(got: Array, wanted: Array) -> float:
+def largest_difference(got: Array, wanted: Array) -> float:
     return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
 
 
@@ -41,9 +45,12 @@ def test_inverse_dynamics_and_gradient_are_those_of_pinocchio(name: str) -> None
     gradient = np.zeros(LINK_PARAMETERS * len(arm.rows))
     for state in REFERENCES[name].states:
         moving(arm, state, state.v)
-        assert apart(torque_for(arm, state.v, state.a), state.inverse_dynamics) <= 1e-12
+        assert (
+            largest_difference(torque_for(arm, state.v, state.a), state.inverse_dynamics)
+            <= 1e-12
+        )
         parameter_gradient(arm.rows, gradient)
-        assert apart(gradient, state.regressor_transpose_r) <= 1e-12
+        assert largest_difference(gradient, state.regressor_transpose_r) <= 1e-12
 
 
 @each
@@ -54,7 +61,7 @@ def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         M = full_matrix(arm)
-        assert apart(M, state.inertia) <= 1e-12
+        assert largest_difference(M, state.inertia) <= 1e-12
         find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
         wanted = state.forward_dynamics
         assert (
@@ -68,31 +75,33 @@ def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         assert (
-            apart(
+            largest_difference(
                 np.array(place_end_effector(arm.rows, chain.tip_origin_m)), state.tip_position
             )
             <= 1e-12
         )
         assert (
-            apart(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian)
+            largest_difference(
+                np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian
+            )
             <= 1e-12
         )
         rotation = arm.rows["R_base"][-1] @ np.array(chain.tip_rotation)
-        assert apart(rotation, state.tip_rotation) <= 1e-12
+        assert largest_difference(rotation, state.tip_rotation) <= 1e-12
 
 
 def test_friction_and_drives_enter_both_dynamics_alike() -> None:
-    """What inverse dynamics asks for a motion makes that motion, with armature and friction too."""
+    """The torque of inverse dynamics for a motion makes that motion, with armature and friction too."""
     arm = build("arm7", armature_kg_m2=0.1, viscous=0.5, coulomb=1.5)
     state, qdd = REFERENCES["arm7"].states[0], np.zeros(7)
     moving(arm, state, state.qd)
     torque = torque_for(arm, state.qd, state.a)
     find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, torque, qdd)
-    assert apart(qdd, state.a) <= 1e-11
+    assert largest_difference(qdd, state.a) <= 1e-11
 
 
 def stop_torque(q: list[float], qd: list[float]) -> Array:
-    """The generalised force of the stops of two joints, N m: what they change of M qdd."""
+    """Returns the generalised force of the stops of two joints, N m: their change of M qdd."""
     arms = (
         build("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0),
         build("random2"),

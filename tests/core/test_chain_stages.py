@@ -1,4 +1,4 @@
-"""The torque of a tick of a chain, joint by joint, by the dynamics that Pinocchio computed for it."""
+"""The torque of a tick of a chain, joint by joint, by the dynamics of Pinocchio."""
 
 import numpy as np
 import pytest
@@ -16,14 +16,14 @@ LAMBDA = 2.0
 
 
 def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
-    """A site with the chain, in a state; its reference is such that v and a are those of the state."""
+    """Returns a site with the chain in a state; with its reference, v and a are those of the state."""
     chain = REFERENCES[name].chain
     joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m)
-        for one in chain.joints
+        ChainJoint(joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m)
+        for joint in chain.joints
     )
     n = len(joints)
-    theta = np.concatenate([one.inertia for one in chain.joints])
+    theta = np.concatenate([joint.inertia for joint in chain.joints])
     law = Gains(Lambda=(LAMBDA,), theta_hat0=theta, known=theta, **gains)  # type: ignore[arg-type]
     arrays = build_site_arrays(
         SiteSetup(
@@ -53,7 +53,7 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
 
 
 def find_torque(arrays: SiteArrays) -> Array:
-    """What the site's law asks in its tick, N m."""
+    """Returns the torque of the site's law in its tick, N m."""
     site, chain = arrays.site[0], arrays.chain
     place_chain(site, chain)
     update_errors(site, chain)
@@ -62,28 +62,31 @@ def find_torque(arrays: SiteArrays) -> Array:
 
 
 @each
-def test_adaptive_torque_is_that_of_pinocchio_less_its_feedback(name: str) -> None:
+def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
     """Eq. (13): Y theta - Kp r - Kd ed, and Y' r of Eq. (15)."""
     for state in REFERENCES[name].states:
         arrays = build(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
         wanted = state.inverse_dynamics - 3.0 * (state.qd - state.v) + 5.0 * state.a / LAMBDA
         np.testing.assert_allclose(find_torque(arrays), wanted, rtol=1e-9, atol=1e-9)
-        found = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
-        np.testing.assert_allclose(found, state.regressor_transpose_r, rtol=1e-9, atol=1e-9)
+        transpose_rows = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
+        np.testing.assert_allclose(
+            transpose_rows, state.regressor_transpose_r, rtol=1e-9, atol=1e-9
+        )
 
 
 @each
 def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
-    """G - K e - d qd - Kd ed, where G is what the inverse dynamics ask of the arm at rest."""
+    """G - K e - d qd - Kd ed, where G is the torque of inverse dynamics for the arm at rest."""
     for state in REFERENCES[name].states:
         arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
-        found = find_torque(arrays)
+        torque = find_torque(arrays)
         still = 0.0 * state.q
         arm = Arm(
-            arrays.chain, np.concatenate([one.inertia for one in REFERENCES[name].chain.joints])
+            arrays.chain,
+            np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints]),
         )
         moving(arm, state._replace(qd=still, a=still), still)
         wanted = torque_for(arm, still, still)
         assert np.abs(wanted).max() > 1e-3
         wanted += 7.0 * state.v / LAMBDA - 2.0 * state.qd + 5.0 * state.a / LAMBDA
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(torque, wanted, rtol=1e-9, atol=1e-9)

@@ -1,4 +1,4 @@
-"""What a channel does to each sample: loss, bursts, copies, outages, order; golden fates (L4)."""
+"""The effect of a channel on each sample: loss, bursts, copies, outages, order; golden fates (L4)."""
 
 import math
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.channels import SEEDS, Ints, channel, due, stamps
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.links.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
@@ -37,7 +37,7 @@ LOSSES: list[LinkBase] = [
 
 
 def bursts(lost: np.ndarray) -> Ints:
-    """Lengths of runs of losses, without one that the end cuts off."""
+    """Returns the lengths of runs of losses, without a run that the end truncates."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], lost]).astype(np.int8)))
     begin, end = edges[::2], edges[1::2]
     return end - begin[: len(end)]
@@ -47,10 +47,12 @@ def bursts(lost: np.ndarray) -> Ints:
 @pytest.mark.parametrize(
     "link", LOSSES, ids=lambda link: f"{link.loss}-{link.loss_burst}-{link.loss_bad}"
 )
-def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: int) -> None:
-    """Gilbert and Elliott; single losses are the chain without memory, whose mean burst is 1 / (1 - p).
+def test_loss_and_burst_follow_their_model(link: LinkBase, seed: int) -> None:
+    """Gilbert and Elliott; single losses are the chain without memory, whose mean burst is 1 /
+    (1 - p).
 
-    The variance of the rate has the chain's correlation 1 - enter - leave in it; lengths are geometric.
+    The variance of the rate includes the chain's correlation 1 - enter - leave; lengths are
+    geometric.
     """
     model = link.to_core_model()
     lost = due(channel([model], seed), COUNT) == LOST
@@ -74,7 +76,7 @@ def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: i
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_first_sample_is_as_likely_to_be_lost_as_any(seed: int) -> None:
+def test_first_samples_are_lost_with_stationary_probability(seed: int) -> None:
     """A chain begins in its stationary distribution, over links of one seed."""
     model = NoDelay(loss=0.4, loss_burst=50).to_core_model()
     first = [due(channel([model], seed, f"a{n}->s"), 1)[0] == LOST for n in range(4000)]
@@ -91,8 +93,8 @@ def test_directions_and_seeds_lose_independently() -> None:
         assert abs(np.corrcoef(series[a], series[b])[0, 1]) < SIGMAS / math.sqrt(100_000)
 
 
-def test_what_is_lost_and_how_long_others_take_are_independent() -> None:
-    """So the delays of what comes through are those of the link without loss."""
+def test_losses_are_independent_of_delays() -> None:
+    """So the delays of the samples that arrive are those of the link without loss."""
     link = UniformDelay(delay_ms=100, half_width_ms=50)
     whole = due(channel([link.to_core_model()]), 10_000)
     holed = due(
@@ -114,21 +116,23 @@ def test_what_is_lost_and_how_long_others_take_are_independent() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_share_of_duplicates(seed: int) -> None:
-    made = channel([NoDelay(duplicate=0.07).to_core_model()], seed)
-    due(made, COUNT)
-    assert abs(int(made.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(0.07 * 0.93 / COUNT)
+def test_copies_have_their_share(seed: int) -> None:
+    link_channel = channel([NoDelay(duplicate=0.07).to_core_model()], seed)
+    due(link_channel, COUNT)
+    assert abs(int(link_channel.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(
+        0.07 * 0.93 / COUNT
+    )
 
 
 def test_the_earlier_of_sample_and_copy_counts() -> None:
     """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
     link = UniformDelay(delay_ms=100, half_width_ms=60)
     single = due(channel([link.to_core_model()]), 100_000)
-    made = channel(
+    link_channel = channel(
         [UniformDelay(delay_ms=100, half_width_ms=60, duplicate=1.0).to_core_model()]
     )
-    doubled = due(made, 100_000)
-    assert made.row.copies == 100_000
+    doubled = due(link_channel, 100_000)
+    assert link_channel.row.copies == 100_000
     assert (doubled <= single).all()
     smaller_ms = (doubled - stamps(100_000)) / 1e6
     assert smaller_ms.mean() == pytest.approx(
@@ -159,17 +163,17 @@ def test_in_order_no_sample_overtakes_an_older_one() -> None:
     assert (np.diff(free[kept]) < 0).any()
 
 
-def test_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> None:
+def test_newly_ordered_links_hold_samples_back() -> None:
     first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
-    made = due(channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80)
-    assert made[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
-    assert made[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
+    due_ns = due(channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80)
+    assert due_ns[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
+    assert due_ns[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
 
 
 @given(playout_ms=st.floats(0, 300))
-def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None:
+def test_play_out_holds_samples_for_its_budget(playout_ms: float) -> None:
     free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).to_core_model()]), 500)
-    held = due(
+    due_ns = due(
         channel(
             [
                 UniformDelay(
@@ -179,7 +183,7 @@ def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None
         ),
         500,
     )
-    assert (held == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
+    assert (due_ns == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
 
 
 # Changes of model.
@@ -194,7 +198,7 @@ def test_a_model_holds_from_its_first_stamp_on() -> None:
     assert (delays // 10**6).tolist() == [5, 5, 5, 5, 9, 9, 9, 1, 1, 1]
 
 
-def test_delay_without_memory_does_not_notice_that_loss_changed() -> None:
+def test_delays_are_unaffected_by_changed_loss() -> None:
     keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
     whole = due(channel([GammaDelay(**keys).to_core_model()]), 2000)
     changed = due(
@@ -221,11 +225,9 @@ def test_delay_without_memory_does_not_notice_that_loss_changed() -> None:
     steps=st.lists(st.integers(1, 60), min_size=1, max_size=30),
     pages=st.sampled_from([64, 128, 8192]),
 )
-def test_fates_are_the_same_in_whatever_steps_they_are_foreseen(
-    name: str, steps: list[int], pages: int
-) -> None:
-    made = channel([KINDS[name]], points=POINTS, pages=pages)
-    parts = [due(made, int(n)) for n in np.cumsum(steps)]
+def test_fates_do_not_depend_on_steps(name: str, steps: list[int], pages: int) -> None:
+    link_channel = channel([KINDS[name]], points=POINTS, pages=pages)
+    parts = [due(link_channel, int(n)) for n in np.cumsum(steps)]
     assert np.concatenate(parts).tolist() == fates(name, sum(steps)).tolist()
 
 
@@ -251,9 +253,9 @@ GOLDEN = {
 
 @pytest.mark.parametrize("name", KINDS)
 def test_golden_fates(name: str) -> None:
-    """When the first eight samples of m1->s are due with seed 1, us; LOST where they are lost."""
-    made = [LOST if ns == LOST else ns // 1000 for ns in fates(name, 8).tolist()]
-    assert made == GOLDEN[name]
+    """The due times of the first eight samples of m1->s with seed 1, us, or LOST."""
+    due_us = [LOST if ns == LOST else ns // 1000 for ns in fates(name, 8).tolist()]
+    assert due_us == GOLDEN[name]
 
 
 _PROGRAM = """
@@ -267,8 +269,8 @@ for name in KINDS:
 
 
 @pytest.mark.long
-def test_without_the_compiler_draws_and_fates_have_the_same_bits() -> None:
-    plain = printed(_PROGRAM, compiled=False)
+def test_uncompiled_draws_and_fates_have_equal_bits() -> None:
+    plain = run_program(_PROGRAM, compiled=False)
     assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)
     assert plain.count("[") == len(KINDS)
-    assert plain == printed(_PROGRAM, compiled=True)
+    assert plain == run_program(_PROGRAM, compiled=True)

@@ -27,7 +27,10 @@ def test_errors(q: Array, qd: Array, q_des: Array, qd_des: Array, Lambda: Array)
 def test_torque(
     a: ArmLinks, q: Array, qd: Array, e: Array, ed: Array, Lambda: Array, Kp: Array, Kd: Array
 ) -> None:
-    """Eq. (11) equals Eq. (13): estimated M, C and G of a wrong arm, and the two damping terms."""
+    """Eq.
+
+    (11) equals Eq. (13): estimated M, C and G of a wrong arm, and the two damping terms.
+    """
     r = qd + Lambda * e
     Y = regressor(9.81, q, qd, -Lambda * e, -Lambda * ed)
     tau = np.array(control.adaptive_torque(Y, theta_from_links(a), Kp, Kd, r, ed, NO_LIMIT))
@@ -45,15 +48,15 @@ def test_torque(
 
 @given(limit=st.floats(0.1, 100.0), ed=speeds)
 def test_torque_is_held_within_its_limit(limit: float, ed: Array) -> None:
-    one, none = np.ones(2), np.zeros(2)
+    ones, none = np.ones(2), np.zeros(2)
     tau = control.adaptive_torque(
-        ((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit
+        ((0.0,) * 5,) * 2, np.zeros(5), ones, 7.0 * ones, none, ed, limit
     )
     assert list(tau) == np.clip(-7.0 * ed, -limit, limit).tolist()
 
 
 @given(q=angles, qd=speeds, v=speeds, a=speeds, r=speeds, gain_s=st.floats(0, 0.1))
-def test_the_estimate_goes_down_gamma_y_transpose_r(
+def test_the_estimate_descends_gamma_y_transpose_r(
     q: Array, qd: Array, v: Array, a: Array, r: Array, gain_s: float
 ) -> None:
     """Eq. (15)."""

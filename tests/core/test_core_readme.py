@@ -1,4 +1,4 @@
-"""The README of the core: its tables and its list of files are those of the code."""
+"""The README of the core has the tables and the list of files of the code."""
 
 import re
 
@@ -33,7 +33,7 @@ def test_the_readme_names_every_file() -> None:
     assert sorted(listed) == sorted(files)
 
 
-def test_every_field_has_a_unit_or_none_a_meaning_and_a_stage() -> None:
+def test_fields_have_a_unit_meaning_and_stage() -> None:
     for fields in FIELDS.values():
         for name, field in fields.items():
             assert field.meaning, name
@@ -60,5 +60,5 @@ def test_layouts_have_the_shapes_of_the_fields() -> None:
     assert link_dtype(3)["key"] == np.uint64
 
 
-def test_links_have_what_laws_and_counts_read() -> None:
+def test_links_have_the_fields_of_laws_and_counts() -> None:
     assert set(FIELDS["link"]) >= {*LinkCounts._fields, *PeerView._fields}

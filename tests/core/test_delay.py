@@ -1,4 +1,4 @@
-"""Every delay model gives the mean, the deviation and the distribution that it states."""
+"""Every delay model has the mean, the deviation and the distribution that it states."""
 
 import math
 from typing import Any
@@ -51,7 +51,7 @@ def log_normal(link: LogNormalDelay) -> Any:
 
 
 class Mixture:
-    """A floor and one of two exponentials, put together from SciPy's."""
+    """A floor and one of two exponentials, composed from SciPy's distributions."""
 
     def __init__(self, link: HyperExponentialDelay) -> None:
         self.parts = [stats.expon(link.floor_ms, mean) for mean in (link.fast_ms, link.slow_ms)]
@@ -132,7 +132,9 @@ def named(value: object) -> str | None:
 
 
 def likely(delays_us: Ints, law: Any) -> bool:
-    """Kolmogorov and Smirnov, at the bounds between whole microseconds, where rounding takes no part."""
+    """Applies Kolmogorov and Smirnov's test at the bounds between whole microseconds, where
+    rounding has no effect.
+    """
     values, counts = np.unique(delays_us, return_counts=True)
     distance = np.abs(np.cumsum(counts) / len(delays_us) - law.cdf((values + 0.5) / 1e3)).max()
     return bool(stats.kstwo.sf(distance, len(delays_us)) > 1e-4)
@@ -141,9 +143,11 @@ def likely(delays_us: Ints, law: Any) -> bool:
 def holds_its_moments(
     link: LinkBase, delays: Ints, mean_factor: float = 1.0, factor: float = 1.0
 ) -> None:
-    """Mean and deviation against the closed form, in standard errors; factors: variances, if correlated.
+    """Compares mean and deviation with the closed form, in standard errors; factors: variances,
+    if correlated.
 
-    Rounding to whole microseconds adds 1/12 us^2 to the variance; the cut at 10 s takes nothing that shows.
+    Rounding to whole microseconds adds 1/12 us^2 to the variance; the cut at 10 s is
+    negligible.
     """
     mean_ms, deviation_ms = link.moments()
     variance = (1e3 * deviation_ms) ** 2 + 1 / 12
@@ -164,8 +168,8 @@ def test_mean_and_deviation_over_a_million_draws(link: LinkBase, law: Any, seed:
 def test_a_uniform_delay_worked_out_by_hand() -> None:
     """From the published generator to microseconds, in Python's integers: purpose 2, attempt 0."""
     key = link_key(1, LINK_NAME)
-    words = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
-    units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in words]
+    draws = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
+    units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in draws]
     expected = [math.floor(200_000 + 150_000 * (2 * u - 1) + 0.5) for u in units]
     assert delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist() == expected
 
@@ -200,7 +204,9 @@ def test_correlated_delays_have_their_moments_and_correlations(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_correlated_delays_cut_at_zero_have_their_moments(seed: int) -> None:
-    """A quarter of them is; a cut sequence is correlated less than the one it was cut from."""
+    """A quarter of the delays is cut; a cut sequence is correlated less than the sequence
+    before the cut.
+    """
     link = CorrelatedDelay(delay_ms=10, deviation_ms=15, correlation=0.8)
     delays = delays_us(link, seed, COUNT)
     assert np.mean(delays == 0) == pytest.approx(stats.norm.cdf(-10 / 15), abs=0.01)
@@ -209,7 +215,7 @@ def test_correlated_delays_cut_at_zero_have_their_moments(seed: int) -> None:
 
 @given(delay_ms=st.floats(0, 1e4), deviation_ms=st.floats(1e-6, 1e4))
 def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms: float) -> None:
-    """Nothing is lost to cancellation: within its deviation, and exact where the cut is far."""
+    """No digits cancel: within its deviation, and exact if the cut is far."""
     mean_ms, deviation = CorrelatedDelay(
         delay_ms=delay_ms, deviation_ms=deviation_ms, correlation=0.5
     ).moments()
@@ -220,7 +226,7 @@ def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms:
 
 
 def test_a_sine_over_whole_periods() -> None:
-    """Its mean, its deviation, its values; chance has no part in it."""
+    """Its mean, its deviation and its values, without any randomness."""
     link = SineDelay(delay_ms=120, amplitude_ms=80, period_s=2.5, phase_rad=0.4)
     delays = delays_us(link, 1, COUNT)
     assert (delays == delays_us(link, 2, COUNT)).all()
@@ -237,7 +243,7 @@ ROWS = [(0.0, 10.0), (0.5, 40.25), (0.75, 0.0), (1.0, 7.5)]
 
 
 @pytest.mark.long
-def test_trace_that_is_looped_has_moments_of_one_pass() -> None:
+def test_looped_traces_have_moments_of_one_pass() -> None:
     link = TraceDelay(trace=format_trace(ROWS), at_end="loop")
     delays = delays_us(link, 1, 1250 * 800)
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, rel=1e-12)
@@ -250,7 +256,7 @@ def test_trace_that_is_looped_has_moments_of_one_pass() -> None:
     stamp_ns=st.integers(0, 10**12),
     at_end=st.sampled_from(list(TraceEnd)),
 )
-def test_a_trace_gives_the_delay_of_its_last_point(
+def test_a_trace_holds_its_last_points_delay(
     gaps_us: list[int], delays: list[int], stamp_ns: int, at_end: TraceEnd
 ) -> None:
     t_us = np.cumsum([0, *gaps_us])
@@ -270,8 +276,8 @@ def test_a_trace_gives_the_delay_of_its_last_point(
 def test_a_trace_may_lose_samples() -> None:
     link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
     points = parse_trace(link.trace)
-    made = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
-    assert made.tolist() == [
+    due_ns = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
+    assert due_ns.tolist() == [
         5_000_000,
         6_000_000,
         7_000_000,
@@ -288,7 +294,7 @@ def test_a_trace_may_lose_samples() -> None:
 
 
 @given(st.floats(-1e12, 1e12))
-def test_delays_are_whole_microseconds_from_zero_to_ten_seconds(delay_us: float) -> None:
+def test_delays_are_whole_microseconds_below_ten_seconds(delay_us: float) -> None:
     rounded = clamp_delay_us(delay_us)
     assert isinstance(rounded, int)
     assert 0 <= rounded <= MAX_DELAY_US

@@ -32,24 +32,24 @@ def matrices(draw: st.DrawFn, zeros: bool = True) -> Array:
 
 
 def strongly_connected(a: Array) -> bool:
-    """By a walk from the first site, there and back."""
+    """Walks from the first site along the edges and against them."""
 
     def reached(edges: Array) -> set[int]:
-        found, new = {0}, [0]
+        visited, new = {0}, [0]
         while new:
             new = [
                 j
                 for i in new
                 for j in np.flatnonzero(edges[i])
-                if j not in found and not found.add(j)
+                if j not in visited and not visited.add(j)
             ]
-        return found
+        return visited
 
     return len(reached(a)) == len(reached(a.T)) == len(a)
 
 
 @given(a=matrices())
-def test_beta_is_the_positive_left_null_vector_of_upsilon(a: Array) -> None:
+def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
     """beta'Upsilon = 0 after Eq. (20), to 1e-12, entry by entry positive."""
     assume(strongly_connected(a))
     beta = perron_vector(a)
@@ -65,13 +65,13 @@ def test_beta_is_numpys_null_vector(a: Array) -> None:
 
 
 @given(a=matrices())
-def test_matrix_is_irreducible_just_where_its_graph_is_strongly_connected(a: Array) -> None:
+def test_irreducible_matrices_have_strongly_connected_graphs(a: Array) -> None:
     assert is_irreducible(a) == strongly_connected(a)
 
 
 @given(a=matrices(zeros=False), closed=st.integers(2, 5))
 def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
-    """The first sites follow each other alone: nobody else weighs anything."""
+    """The first sites follow each other alone: all other sites have no weight."""
     assume(closed < len(a))
     a[:closed, closed:] = 0.0
     a[:closed] /= a[:closed].sum(1, keepdims=True)
@@ -91,7 +91,7 @@ def test_beta_of_three_sites_in_closed_form(shares: tuple[float, float, float]) 
 
 
 @given(share=st.floats(0.01, 0.99))
-def test_ones_are_a_left_null_vector_of_circulant_shares_only(share: float) -> None:
+def test_only_circulant_shares_have_ones_as_vector(share: float) -> None:
     """The paper's beta = (1, 1, 1) fits one free parameter, not three."""
     rest = 1 - share
     circulant = np.array([[0, share, rest], [rest, 0, share], [share, rest, 0]])
@@ -113,7 +113,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "own", "words"),
+    ("row", "own", "phrase"),
     [
         ([0.2, 0.8, 0.0], 0, "does not follow itself"),
         ([0.0, 1.5, -0.5], 0, "between 0 and 1"),
@@ -122,7 +122,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
         ([0.0, np.inf, 0.5], 0, "finite"),
     ],
 )
-def test_a_row_that_cannot_be_says_why(row: list[float], own: int, words: str) -> None:
+def test_an_invalid_row_gives_the_reason(row: list[float], own: int, phrase: str) -> None:
     fault = find_row_problem(np.array(row), own)
     assert fault is not None
-    assert words in fault
+    assert phrase in fault

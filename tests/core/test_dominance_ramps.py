@@ -1,4 +1,4 @@
-"""Shares while they change: functions of time and of the ramps alone, and rows that keep their sum."""
+"""Changing shares are functions of time and of the ramps alone, and rows keep their sum."""
 
 import math
 from fractions import Fraction
@@ -24,7 +24,7 @@ Ramps = list[DominanceRamp]
 
 @st.composite
 def rows(draw: st.DrawFn) -> Row:
-    """Shares that sum to 1 as closely as doubles do."""
+    """Draws shares that sum to 1 as closely as doubles do."""
     parts = draw(st.lists(st.integers(0, 10**6), min_size=PEERS, max_size=PEERS))
     assume(sum(parts) > 0)
     return tuple(part / sum(parts) for part in parts)
@@ -32,7 +32,9 @@ def rows(draw: st.DrawFn) -> Row:
 
 @st.composite
 def ramp_lists(draw: st.DrawFn) -> Ramps:
-    """Up to six ramps in the order of their starts; they may overlap, touch, take no time, or begin at 0."""
+    """Draws up to six ramps in the order of their starts; they may overlap, touch, take no
+    time, or begin at 0.
+    """
     starts = sorted(draw(st.lists(st.integers(0, 10 * S), max_size=6)))
     lasts = st.one_of(st.just(0), st.integers(1, 5 * S))
     return [DominanceRamp(start, start + draw(lasts), draw(rows())) for start in starts]
@@ -45,14 +47,14 @@ def table(first: Row, ramps: Ramps) -> np.ndarray:
 
 
 def shares(t_ns: int, first: Row, ramps: Ramps) -> tuple[list[float], list[float]]:
-    """(alpha, its derivative) per peer."""
+    """Returns (alpha, its derivative) per peer."""
     links = np.zeros(PEERS, link_dtype(2))
     apply_ramps(t_ns, 1 + len(ramps), table(first, ramps), links)
     return links["alpha"].tolist(), links["alpha_rate"].tolist()
 
 
 def exact(t_ns: int, first: Row, ramps: Ramps) -> list[Fraction]:
-    """The same in fractions: each ramp leads from where the ones before it are to its own end."""
+    """Returns the same in fractions: each ramp leads from the value of the earlier ramps to its own end."""
     if not ramps or t_ns < ramps[0].start_ns:
         return [Fraction(a) for a in first]
     last = max(n for n, ramp in enumerate(ramps) if ramp.start_ns <= t_ns)
@@ -77,7 +79,7 @@ def test_shares_are_those_of_the_ramps(first: Row, ramps: Ramps, t_ns: int) -> N
 
 @given(first=rows(), ramps=ramp_lists(), t_ns=times)
 def test_a_row_sums_to_one_at_all_times(first: Row, ramps: Ramps, t_ns: int) -> None:
-    """Within two units in the last place, plus what its rows are off themselves."""
+    """Within two units in the last place, plus the error of the given rows."""
     alpha, rates = shares(t_ns, first, ramps)
     off = max(abs(math.fsum(row) - 1.0) for row in (first, *(ramp.alpha for ramp in ramps)))
     assert abs(math.fsum(alpha) - 1.0) <= 2 * ULP + off
@@ -95,9 +97,9 @@ def test_the_derivative_is_the_finite_difference(first: Row, ramps: Ramps, t_ns:
     step_ns = 1000
     edges = [edge for ramp in ramps for edge in (ramp.start_ns, ramp.end_ns)]
     assume(not any(t_ns < edge <= t_ns + step_ns for edge in edges))
-    here, rates = shares(t_ns, first, ramps)
-    there, _ = shares(t_ns + step_ns, first, ramps)
-    for a, b, rate in zip(here, there, rates, strict=True):
+    share, rates = shares(t_ns, first, ramps)
+    later_share, _ = shares(t_ns + step_ns, first, ramps)
+    for a, b, rate in zip(share, later_share, rates, strict=True):
         assert (b - a) / (step_ns * 1e-9) == pytest.approx(rate, rel=1e-6, abs=1e-9)
 
 
@@ -105,7 +107,7 @@ def test_the_derivative_is_the_finite_difference(first: Row, ramps: Ramps, t_ns:
 
 
 def site(ramps: tuple[DominanceRamp, ...] = ()) -> Site:
-    """Follows a peer at rest at (1, -1) and one that moves at (0.5, 0) rad/s."""
+    """Returns a site that follows a peer at rest at (1, -1) and one that moves at (0.5, 0) rad/s."""
     links = (LinkSetup("a", 0.9, 1000, (1.0, -1.0)), LinkSetup("b", 0.1, 1000, (0.0, 0.0)))
     return Site(setup()._replace(links=links, ramps=ramps))
 
@@ -114,15 +116,15 @@ def moving(k: int) -> Arrival:
     return Arrival(1, k - 1, (0.5e-3 * (k - 1), 0.0), (0.5, 0.0))
 
 
-def ran(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
+def run_site(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
     return stepped(
         made, [TickInput(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)]
     )
 
 
-def test_a_sites_reference_and_its_derivative_follow_its_shares() -> None:
-    """Eq. (6) with shares that change: the derivative has their rates in it."""
-    outputs = ran(site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
+def test_references_follow_changing_shares() -> None:
+    """Eq. (6) with shares that change: the derivative contains their rates."""
+    outputs = run_site(site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     t_s = np.arange(3000) / 1000
     a = np.clip(0.9 - 0.8 * (t_s - 1), 0.1, 0.9)
@@ -134,45 +136,45 @@ def test_a_sites_reference_and_its_derivative_follow_its_shares() -> None:
     assert np.abs(central[inside - 1] - qd[inside]).max() < 1e-3
 
 
-def test_a_command_is_what_the_script_would_have_been() -> None:
+def test_a_command_equals_the_scripted_ramp() -> None:
     ramp = DominanceRamp(S, 2 * S, (0.1, 0.9))
-    commanded = ran(site(), {700: [CoreChange("shares", ramp=ramp)]})
-    scripted = ran(site((ramp,)), {})
+    commanded = run_site(site(), {700: [CoreChange("shares", ramp=ramp)]})
+    scripted = run_site(site((ramp,)), {})
     assert [o._replace(cmd=[]) for o in commanded] == scripted
     assert commanded[700].cmd == ["shares"]
 
 
-def test_a_command_before_what_is_planned_comes_first() -> None:
-    """What the scenario plans for later still comes then."""
+def test_earlier_commands_precede_planned_ramps() -> None:
+    """Later ramps of the scenario still take place."""
     planned, sooner = DominanceRamp(2 * S, 2 * S, (0.0, 1.0)), DominanceRamp(S, S, (0.5, 0.5))
-    outputs = ran(site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
+    outputs = run_site(site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
     assert [outputs[k].q_des[1] for k in (999, 1000, 1999, 2000)] == [-0.9, -0.5, -0.5, 0.0]
 
 
 def test_more_commands_than_a_run_takes_are_refused() -> None:
-    made = site()
+    site_of_run = site()
     for n in range(MAX_RAMPS):
-        made.apply_change(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
+        site_of_run.apply_change(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
     with pytest.raises(ValueError, match="256"):
-        made.apply_change(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0)
+        site_of_run.apply_change(
+            CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0
+        )
 
 
-def test_each_ramp_begins_where_the_one_before_was() -> None:
-    """Those that are over are folded into one row: the same bits as of a site that was given all of them."""
+def test_each_ramp_begins_where_the_last_was() -> None:
+    """Finished ramps are folded into one row: the same bits as of a site that keeps all of them."""
     ramps = []
     for n in range(MAX_RAMPS + 50):
         start_ns, share = (7 * n + 100) * 1_000_000, 0.5 + 0.4 * math.sin(0.1 * n)
         ramps.append(DominanceRamp(start_ns, start_ns + 500_000_000, (share, 1.0 - share)))
     orders = {7 * n: [CoreChange("", ramp=ramp)] for n, ramp in enumerate(ramps)}
-    commanded = ran(site(), orders)
-    assert [o._replace(cmd=[]) for o in commanded] == ran(site(tuple(ramps)), {})
+    commanded = run_site(site(), orders)
+    assert [o._replace(cmd=[]) for o in commanded] == run_site(site(tuple(ramps)), {})
     assert 7 * len(orders) < 3000
 
 
 @given(rows(), ramp_lists(), st.integers(0, 12 * S), st.integers(0, 12 * S))
-def test_folded_ramps_write_the_same_bits_from_then_on(
-    first: Row, ramps: Ramps, t: int, later: int
-) -> None:
+def test_folded_ramps_keep_the_bits(first: Row, ramps: Ramps, t: int, later: int) -> None:
     folded = table(first, ramps)
     count = fold_ramps(min(t, later), 1 + len(ramps), folded)
     links = np.zeros(PEERS, link_dtype(2))

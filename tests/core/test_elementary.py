@@ -10,14 +10,14 @@ from trilat_net.core.arms.elementary import LARGEST_RAD, sincos
 
 
 @given(st.floats(-1e5, 1e5))
-def test_they_are_right_to_unit_in_last_place_of_one(x: float) -> None:
+def test_results_are_right_to_one_last_place(x: float) -> None:
     s, c = sincos(x)
     assert abs(s - math.sin(x)) <= 2.3e-16
     assert abs(c - math.cos(x)) <= 2.3e-16
 
 
 @given(st.floats(-LARGEST_RAD, LARGEST_RAD))
-def test_further_out_they_are_as_good_as_angle_is_known(x: float) -> None:
+def test_large_angles_lose_only_their_own_precision(x: float) -> None:
     s, c = sincos(x)
     assert abs(s - math.sin(x)) <= 2.3e-16 + math.ulp(x)
     assert abs(c - math.cos(x)) <= 2.3e-16 + math.ulp(x)
@@ -25,7 +25,7 @@ def test_further_out_they_are_as_good_as_angle_is_known(x: float) -> None:
 
 
 @given(st.floats(0, 1e5))
-def test_one_is_odd_and_the_other_even(x: float) -> None:
+def test_sine_is_odd_and_cosine_even(x: float) -> None:
     """Between the odd multiples of an eighth of a turn, where the rounding to a quarter is one-sided."""
     if abs((x * 2 / math.pi) % 1.0 - 0.5) < 1e-9:
         return
@@ -34,7 +34,7 @@ def test_one_is_odd_and_the_other_even(x: float) -> None:
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, -math.inf, 2.0**31])
-def test_what_is_no_angle_has_none(x: float) -> None:
+def test_an_infinite_angle_has_no_sine(x: float) -> None:
     s, c = sincos(x)
     assert math.isnan(s)
     assert math.isnan(c)

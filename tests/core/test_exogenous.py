@@ -1,4 +1,4 @@
-"""What acts on an arm, Eq. (8), against closed forms, potentials and NumPy."""
+"""External torques on an arm, Eq. (8), against closed forms, potentials and NumPy."""
 
 import math
 from typing import Any
@@ -43,13 +43,13 @@ def torque(
 
 
 def tip(q: Array) -> Array:
-    """Where the tip is, by complex numbers."""
+    """Returns the position of the tip, by complex numbers."""
     z = LENGTHS[0] * np.exp(1j * q[0]) + LENGTHS[1] * np.exp(1j * (q[0] + q[1]))
     return np.array([z.real, z.imag])
 
 
 def downhill(potential, q: Array) -> Array:
-    """Minus the gradient of a potential, by central differences."""
+    """Returns minus the gradient of a potential, by central differences."""
     steps = np.eye(2) * STEP
     return np.array(
         [(potential(q - step) - potential(q + step)) / (2 * STEP) for step in steps]
@@ -60,7 +60,7 @@ def still(q: Array) -> Array:
     return np.zeros_like(q)
 
 
-def test_a_pulse_is_symmetric_full_in_the_middle_zero_outside() -> None:
+def test_pulses_are_symmetric_and_zero_outside() -> None:
     pulse = TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0))
 
     def at(t_s: float) -> list[float]:
@@ -73,7 +73,7 @@ def test_a_pulse_is_symmetric_full_in_the_middle_zero_outside() -> None:
 
 
 @given(q=angles, qd=speeds, t_s=st.floats(0, 4))
-def test_what_acts_adds_up(q: Array, qd: Array, t_s: float) -> None:
+def test_external_torques_add_up(q: Array, qd: Array, t_s: float) -> None:
     actors = (
         TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0)),
         TorqueSource(
@@ -95,13 +95,13 @@ def test_what_acts_adds_up(q: Array, qd: Array, t_s: float) -> None:
         TorqueSource(TorqueKind.VISCOUS, B=(2.0, 3.0)),
         TorqueSource(TorqueKind.WALL, K=(100.0, 0.0), a=(0.5, 0.0), b=(-1.0, 0.0)),
     )
-    apart = sum(torque(t_s, q, qd, actor) for actor in actors)
-    assert torque(t_s, q, qd, *actors) == pytest.approx(apart, abs=1e-9)
+    torque_sum = sum(torque(t_s, q, qd, actor) for actor in actors)
+    assert torque(t_s, q, qd, *actors) == pytest.approx(torque_sum, abs=1e-9)
 
 
 @given(q=angles, K=stiff, target=pairs)
-def test_a_hand_that_stays_is_a_spring(q: Array, K: Pair, target: Pair) -> None:
-    """Its torque is what its energy 1/2 K (q - target)^2 goes downhill by."""
+def test_a_resting_hand_is_a_spring(q: Array, K: Pair, target: Pair) -> None:
+    """Its torque is the negative gradient of its energy 1/2 K (q - target)^2."""
     hand = TorqueSource(TorqueKind.HAND, K=K, a=target, b=target)
 
     def potential(at: Array) -> float:
@@ -120,15 +120,15 @@ def test_hand_at_tip_is_spring_in_plane(q: Array, K: Pair, target: Pair) -> None
     assert torque(1.0, q, still(q), hand) == pytest.approx(downhill(potential, q), abs=1e-4)
 
 
-@given(q=angles, K=st.floats(0, 1000), place=pairs, direction=st.floats(-4, 4))
+@given(q=angles, K=st.floats(0, 1000), point=pairs, direction=st.floats(-4, 4))
 def test_a_wall_is_a_spring_on_one_side(
-    q: Array, K: float, place: Pair, direction: float
+    q: Array, K: float, point: Pair, direction: float
 ) -> None:
     normal = (math.cos(direction), math.sin(direction))
-    wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=place, b=normal)
+    wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=point, b=normal)
 
     def potential(at: Array) -> float:
-        return float(0.5 * K * max(0.0, (np.array(place) - tip(at)) @ normal) ** 2)
+        return float(0.5 * K * max(0.0, (np.array(point) - tip(at)) @ normal) ** 2)
 
     expected = downhill(potential, q)
     assert torque(1.0, q, still(q), wall) == pytest.approx(
@@ -140,7 +140,7 @@ def test_a_wall_is_a_spring_on_one_side(
     q=angles, qd=speeds, K=st.floats(0, 1000), B=st.floats(0, 1000), direction=st.floats(-4, 4)
 )
 def test_a_wall_never_pulls(q: Array, qd: Array, K: float, B: float, direction: float) -> None:
-    """Whatever its damping, the force that it gives points along its normal, or is none."""
+    """Whatever its damping, the wall's force points along its normal, or is zero."""
     normal = np.array([math.cos(direction), math.sin(direction)])
     pushed = torque(
         1.0,
@@ -154,7 +154,7 @@ def test_a_wall_never_pulls(q: Array, qd: Array, K: float, B: float, direction: 
 
 
 @given(q=angles, qd=speeds, B=stiff)
-def test_what_is_viscous_takes_power_in_any_motion(q: Array, qd: Array, B: Pair) -> None:
+def test_viscous_elements_dissipate_in_any_motion(q: Array, qd: Array, B: Pair) -> None:
     assert torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(
         -np.array(B) * qd
     )
@@ -176,7 +176,7 @@ def test_a_move_has_minimum_jerk(start: float, length: float, x: float) -> None:
     )
 
 
-def test_a_target_stands_still_before_and_after_its_move() -> None:
+def test_targets_stand_still_outside_their_move() -> None:
     hand = TorqueSource(
         TorqueKind.HAND,
         K=(1.0, 1.0),
@@ -204,35 +204,35 @@ def test_recorded_torque_is_linear_between_its_points(
     rows: list[tuple[float, ...]], t_s: float
 ) -> None:
     table = np.array(sorted(rows))
-    found = torque(
+    torques = torque(
         t_s, np.zeros(2), np.zeros(2), TorqueSource(TorqueKind.RECORDED, table=table)
     )
     nothing = {"left": 0.0, "right": 0.0}
     expected = [np.interp(t_s, table[:, 0], table[:, 1 + i], **nothing) for i in (0, 1)]
-    assert found == pytest.approx(expected, abs=1e-9)
+    assert torques == pytest.approx(expected, abs=1e-9)
 
 
 @given(t_s=st.floats(2.0, 20.0), ends=st.tuples(st.floats(0.1, 20.0), st.floats(0.1, 20.0)))
-def test_a_chirp_sweeps_its_frequencies_evenly_and_begins_again(
+def test_chirps_sweep_their_frequencies_evenly_and_repeat(
     t_s: float, ends: tuple[float, float]
 ) -> None:
     """By SciPy's chirp."""
     source = TorqueSource(TorqueKind.CHIRP, 2.0, 30.0, 2.0, 6.0, (3.0, -1.0), ends)
     sine = signal.chirp((t_s - 2.0) % 4.0, ends[0], 4.0, ends[1], phi=-90)
-    found = torque(t_s, np.zeros(2), np.zeros(2), source)
-    assert found == pytest.approx([3.0 * sine, -sine], abs=1e-6)
+    torques = torque(t_s, np.zeros(2), np.zeros(2), source)
+    assert torques == pytest.approx([3.0 * sine, -sine], abs=1e-6)
 
 
-def test_a_multisine_has_its_lines_and_nothing_else() -> None:
-    """Of its spectrum over a period, and its peak is far below the sum of its amplitudes."""
+def test_a_multisine_has_only_its_lines() -> None:
+    """By its spectrum over a period; its peak is far below the sum of its amplitudes."""
     hz = (0.5, 0.75, 1.0, 2.5, 4.0, 7.0, 7.25, 9.0)
     source = Multisine(amplitude_nm=(2.0, 0.0), frequencies_hz=hz, start_s=1.0).actor
     t_s = 1.0 + np.arange(400) / 100.0
-    found = np.array([torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
-    amplitude = 2.0 * np.abs(np.fft.rfft(found)) / len(found)
+    torques = np.array([torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
+    amplitude = 2.0 * np.abs(np.fft.rfft(torques)) / len(torques)
     expected = np.where(np.isin(np.arange(201) / 4.0, hz), 2.0, 0.0)
     assert amplitude == pytest.approx(expected, abs=1e-9)
-    assert np.abs(found).max() < 0.75 * 2.0 * len(hz)
+    assert np.abs(torques).max() < 0.75 * 2.0 * len(hz)
     given_phases = Multisine(
         amplitude_nm=(1.0, 1.0), frequencies_hz=(2.0,), phases_rad=(0.5,)
     ).actor
@@ -241,12 +241,12 @@ def test_a_multisine_has_its_lines_and_nothing_else() -> None:
     )
 
 
-def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
+def test_sampled_and_continuous_torques_are_separate() -> None:
     rest = np.zeros(2)
-    held = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
+    torque_source = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
     other = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(5.0, 5.0))
-    assert torque(1.0, rest, rest, held, other).tolist() == [5.0, 5.0]
-    assert torque(1.0, rest, rest, held, other, sampled=True).tolist() == [1.0, 1.0]
+    assert torque(1.0, rest, rest, torque_source, other).tolist() == [5.0, 5.0]
+    assert torque(1.0, rest, rest, torque_source, other, sampled=True).tolist() == [1.0, 1.0]
 
 
 class ConstantEffort(OwnActor, frozen=True, tag="constant_effort"):
@@ -256,7 +256,7 @@ class ConstantEffort(OwnActor, frozen=True, tag="constant_effort"):
 
 
 @pytest.mark.parametrize("acts", list(TorqueKind))
-def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None:
+def test_no_torque_acts_outside_its_time(acts: TorqueKind) -> None:
     table = np.array([[0.0, 1.2, 1.0], [9.0, 1.0, 1.0]])
     vectors = {"a": (1.0, 0.0), "b": (-1.0, 0.0), "K": (9.0, 9.0), "B": (1.0, 1.0)}
     model = ConstantEffort() if acts in OWN_KINDS else None
@@ -270,8 +270,8 @@ def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None
 
 
 @pytest.mark.parametrize(("acts", "like"), [("LIVE_TIP", "TASK_HAND"), ("LIVE_JOINT", "HAND")])
-def test_a_live_hand_is_a_spring_to_its_target(acts: str, like: str) -> None:
-    """As far as it is held, and within its limit: then the direction stays and the size is the limit."""
+def test_live_hands_are_springs_with_limits(acts: str, like: str) -> None:
+    """The force is scaled by the grip; beyond the limit its direction stays and its size is the limit."""
     q, qd = np.array([0.1, 0.2]), np.zeros(2)
     vectors = {"a": (1.2, 0.3), "b": (1.2, 0.3), "K": (50.0, 50.0), "B": (4.0, 4.0)}
     spring = torque(1.0, q, qd, TorqueSource(TorqueKind[like], **vectors))

@@ -2,13 +2,13 @@
 
 import pytest
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from trilat_net.core.step.fingerprint import compute_fingerprint
 
 PROGRAM = "from trilat_net.core.step.fingerprint import compute_fingerprint; print(compute_fingerprint())"
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_it_is_sixteen_digits_and_equal_in_every_process(compiled: bool) -> None:
+def test_fingerprints_are_sixteen_digits_in_every_process(compiled: bool) -> None:
     assert f"{int(compute_fingerprint(), 16):016x}" == compute_fingerprint()
-    assert printed(PROGRAM, compiled=compiled).strip() == compute_fingerprint()
+    assert run_program(PROGRAM, compiled=compiled).strip() == compute_fingerprint()

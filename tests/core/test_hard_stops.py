@@ -39,7 +39,11 @@ def test_drawn_faults_keep_their_bounds() -> None:
 
 @pytest.mark.parametrize("rate_nm_s", RATES_NM_S[1:])
 def test_no_stop_adds_energy_to_a_swinging_arm(rate_nm_s: float) -> None:
-    """Eq. (5), at speeds to 50 rad/s: a law that swings up over its delay was stopped at its fastest."""
+    """Eq.
+
+    (5), at speeds to 50 rad/s: a law that swings up because of its delay was stopped at its
+    fastest.
+    """
     keys = {"duration_s": 1.6, **RULE, **FAST, "limits.tau_rate_limit_nm_s": rate_nm_s}
     log = trilat_net.simulate(load_scenario("free", keys))
     for site in log.scenario.names:

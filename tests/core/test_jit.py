@@ -1,4 +1,4 @@
-"""Machine code of the cache: what one process has compiled another may load, beside that of a third."""
+"""Machine code in the cache: code of one process may be loaded by another, beside that of a third."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 
 SYMBOLS = """
 import numba, numpy as np
@@ -21,11 +21,12 @@ for n in {}:
 """
 
 
-def test_symbols_of_leaves_tell_layouts_apart() -> None:
-    """As Numba numbers them, the first layout of any process has the symbols of any other's."""
+def test_symbols_of_leaves_separate_layouts() -> None:
+    """With Numba's numbering, the first layouts of all processes would have equal symbols."""
     one, other = (
         dict(
-            line.split() for line in printed(SYMBOLS.format(order), compiled=True).splitlines()
+            line.split()
+            for line in run_program(SYMBOLS.format(order), compiled=True).splitlines()
         )
         for order in ((6, 7), (7, 6))
     )
@@ -46,10 +47,12 @@ for factor in map(float, sys.argv[1:]):
 """
 
 
-def test_equal_closures_of_two_processes_are_told_apart(
+def test_equal_closures_of_two_processes_are_separate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As built-in laws are: the same numbers in and out, another torque; one process loads them all."""
+    """Like built-in laws, they have equal signatures and different torques; one process loads
+    all of them.
+    """
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     file = tmp_path / "closures.py"
     file.write_text(CLOSURES)
@@ -92,7 +95,9 @@ print(count.number)
 
 
 def run_leaves(folder: Path, cache: Path, **more: str) -> tuple[str, int]:
-    """What leaves compute with a wheel's folder and a user's cache, and how many were compiled for it."""
+    """Returns the results of leaves with a wheel's folder and a user's cache, and how many were
+    compiled.
+    """
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), **more}
     program = [sys.executable, "-c", LEAVES, folder]
     done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
@@ -100,7 +105,7 @@ def run_leaves(folder: Path, cache: Path, **more: str) -> tuple[str, int]:
     return "\n".join(said), int(number)
 
 
-def test_a_wheels_code_compiles_nothing_and_has_the_hosts_bits(tmp_path: Path) -> None:
+def test_wheels_compile_nothing_and_keep_the_bits(tmp_path: Path) -> None:
     host, compiled = run_leaves(tmp_path / "none", tmp_path / "host")
     generic, _ = run_leaves(tmp_path / "none", tmp_path / "generic", NUMBA_CPU_NAME="generic")
     within = shutil.ignore_patterns("*-within*")

@@ -36,7 +36,7 @@ def energy(q: Array, qd: Array) -> float:
 
 @settings(max_examples=30)
 @given(q=angles, qd=physics.vectors(physics.st.floats(-3, 3)))
-def test_an_arm_that_is_left_alone_keeps_its_energy(q: Array, qd: Array) -> None:
+def test_an_arm_without_torque_keeps_its_energy(q: Array, qd: Array) -> None:
     assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2))) == pytest.approx(
         energy(q, qd), abs=1e-5
     )
@@ -51,7 +51,10 @@ SPAN_S = 0.1
 
 
 def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
-    """Distance from a solution of Eq. (8) by another method, for each number of periods in the span."""
+    """Returns the distance from a solution of Eq.
+
+    (8) by another method, for each number of periods in the span.
+    """
 
     def rate(t: float, x: Array) -> Array:
         hands = sum(p[2:] * np.sin(np.pi * (t - p[0]) / (p[1] - p[0])) ** 2 for p in PULSES)
@@ -65,18 +68,20 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
 
     start = np.concatenate([q, qd])
     exact = solve_ivp(rate, (0.0, SPAN_S), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    made = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
-    return [float(np.abs(one - exact).max() / (1 + np.abs(exact).max())) for one in made]
+    ends = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
+    return [
+        float(np.abs(end_state - exact).max() / (1 + np.abs(exact).max())) for end_state in ends
+    ]
 
 
 @settings(max_examples=10)
 @given(q=angles, qd=speeds, u=physics.vectors(physics.st.floats(-50, 50)))
-def test_it_follows_the_equation_of_motion(q: Array, qd: Array, u: Array) -> None:
+def test_motion_solves_the_equation_of_motion(q: Array, qd: Array, u: Array) -> None:
     assert errors(q, qd, u, 400)[0] < 1e-6
 
 
 @pytest.mark.push
-def test_its_order_is_four() -> None:
+def test_the_integrators_order_is_four() -> None:
     """In the median of many states: in a single one leading terms may cancel."""
     chance = np.random.default_rng(4)
     orders = []

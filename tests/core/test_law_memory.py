@@ -1,4 +1,4 @@
-"""What a law of one's own remembers goes to its record as numbers, and comes back in its own form."""
+"""The memory of a user's law is recorded as numbers, and restored in its own form."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ class Holder:
 
 
 def describe(value: Any) -> Any:
-    """The form of a value: its types, and the shapes of its arrays."""
+    """Returns the form of a value: its types, and the shapes of its arrays."""
     if isinstance(value, np.ndarray):
         return value.dtype, value.shape
     return (
@@ -40,7 +40,7 @@ def describe(value: Any) -> Any:
 
 
 @given(values)
-def test_memory_of_a_law_comes_back_in_its_own_form(kept: Any) -> None:
+def test_memory_is_restored_in_its_own_form(kept: Any) -> None:
     first, again = Holder(kept), Holder(kept)
     memory = read_memory(first)
     write_memory(again, memory)
@@ -49,7 +49,7 @@ def test_memory_of_a_law_comes_back_in_its_own_form(kept: Any) -> None:
 
 
 @given(arrays(np.float64, shapes, elements=reals), reals)
-def test_arrays_of_memory_take_their_own_numbers_in_order(kept: Any, behind: float) -> None:
+def test_arrays_of_memory_take_numbers_in_order(kept: Any, behind: float) -> None:
     law = Holder([np.zeros_like(kept), 0.0])
     write_memory(law, [*kept.ravel().tolist(), behind])
     np.testing.assert_array_equal(law.kept[0], kept)

@@ -21,7 +21,7 @@ def stamp_ns(tick: int, rate_hz: int) -> int:
 
 
 class SampleList:
-    """L2 by brute force: of all samples that are due, the newest that has arrived."""
+    """L2 by brute force: of all due samples, the newest that has arrived."""
 
     def __init__(self, rate_hz: int, peer_rate_hz: int, delay_ns: int) -> None:
         self.rate_hz, self.peer_rate_hz, self.delay_ns = rate_hz, peer_rate_hz, delay_ns
@@ -52,7 +52,7 @@ class SampleList:
     delay_us=st.one_of(st.just(0), st.integers(0, 50_000), st.integers(0, 10_000_000)),
     tick=st.integers(0, 10_000),
 )
-def test_a_sample_is_released_when_due_never_at_its_stamp(
+def test_samples_are_released_when_due_after_stamp(
     rate_hz: int, peer_rate_hz: int, delay_us: int, tick: int
 ) -> None:
     released = one_link(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(0, tick)
@@ -79,15 +79,15 @@ def test_no_delay_means_one_period() -> None:
 def test_the_newest_due_sample_is_in_use(
     rate_hz: int, peer_rate_hz: int, delay_us: int, data: st.DataObject
 ) -> None:
-    """Any order, late ones, duplicates, and stamps of the future: all against the list."""
+    """Any order, late samples, duplicates, and stamps of the future, all against the list."""
     rates_and_delay = (rate_hz, peer_rate_hz, delay_us * 1000)
     site, model = one_link(*rates_and_delay), SampleList(*rates_and_delay)
     arrivals = st.lists(st.integers(-1, 40), max_size=6)
     for k in range(25):
-        came = data.draw(arrivals)
-        for tick in came:
+        arrival_list = data.draw(arrivals)
+        for tick in arrival_list:
             model.take(k, tick)
-        output = site.step(TickInput(k, [sample(tick) for tick in came]))
+        output = site.step(TickInput(k, [sample(tick) for tick in arrival_list]))
         used = model.used(k)
         assert output.used == [used]
         if used >= 0:
@@ -99,7 +99,7 @@ def test_the_newest_due_sample_is_in_use(
 
 
 @pytest.mark.parametrize("peer_rate_hz", [1, 1000, 20_000])
-def test_a_stamp_more_than_ten_seconds_ahead_is_refused(peer_rate_hz: int) -> None:
+def test_stamps_ten_seconds_ahead_are_refused(peer_rate_hz: int) -> None:
     site = one_link(1000, peer_rate_hz, 0)
     limit = 10 * peer_rate_hz
     site.step(TickInput(0, [sample(limit), sample(limit + 1)]))
@@ -107,14 +107,14 @@ def test_a_stamp_more_than_ten_seconds_ahead_is_refused(peer_rate_hz: int) -> No
 
 
 @given(rate_hz=st.integers(1, 20_000))
-def test_a_calendar_has_a_page_for_all_that_may_wait(rate_hz: int) -> None:
-    """The longest delay of a sample from as far ahead as any."""
+def test_calendars_have_pages_for_all_waiting_samples(rate_hz: int) -> None:
+    """The longest delay of a sample stamped as far ahead as allowed."""
     pages = calendar_pages(rate_hz)
     assert pages & (pages - 1) == 0
     assert pages > 20 * rate_hz + 1
 
 
-def test_samples_from_far_ahead_wait_without_touching_nearer_ones() -> None:
+def test_early_samples_leave_nearer_ones_alone() -> None:
     site = one_link(1000, 1000, 10_000_000_000)
     first = [sample(m) for m in range(0, 10_001, 50)]
     outputs = stepped(site, [TickInput(0, first), *(TickInput(k) for k in range(1, 20_001))])
@@ -127,11 +127,11 @@ def test_samples_from_far_ahead_wait_without_touching_nearer_ones() -> None:
 
 
 def bookkeeping_holds(delay_ms: float) -> bool:
-    """Whether the record of tick k used tick k - 200 of each peer, and its state, exactly."""
-    made = run("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
+    """Asserts that the record of tick k used tick k - 200 of each peer, and that peer's state, exactly."""
+    records = run("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
     expected = np.maximum(np.arange(2000) - 200, -1)
-    for name, site in made.sites.items():
-        peers = [made.sites[p] for p in made.scenario.peers(name)]
+    for name, site in records.sites.items():
+        peers = [records.sites[p] for p in records.scenario.peers(name)]
         if not all((site.used[:, j] == expected).all() for j in range(2)):
             return False
         mean = 0.5 * peers[0].q[:-200] + 0.5 * peers[1].q[:-200]
@@ -141,32 +141,32 @@ def bookkeeping_holds(delay_ms: float) -> bool:
 
 
 @pytest.mark.parametrize("delay_ms", [200.0, 199.001])
-def test_tick_k_uses_tick_k_minus_200_of_each_peer(delay_ms: float) -> None:
-    """Also where the sample is due between two ticks: the later one has it."""
+def test_peers_are_used_200_ticks_later(delay_ms: float) -> None:
+    """If the sample is due between two ticks, the later tick uses the sample."""
     assert bookkeeping_holds(delay_ms)
 
 
 @pytest.mark.parametrize("delay_ms", [199.0, 200.001, 201.0])
-def test_a_slip_of_one_tick_fails_that_check(delay_ms: float) -> None:
+def test_the_check_fails_for_one_tick_less(delay_ms: float) -> None:
     assert not bookkeeping_holds(delay_ms)
 
 
 def test_each_link_of_asymmetric_has_its_own_delay() -> None:
-    made = run("asymmetric", {"duration_s": 1.0})
-    for name, site in made.sites.items():
-        for j, peer in enumerate(made.scenario.peers(name)):
-            slip = round(made.scenario.links[f"{peer}->{name}"].delay_ms)
+    records = run("asymmetric", {"duration_s": 1.0})
+    for name, site in records.sites.items():
+        for j, peer in enumerate(records.scenario.peers(name)):
+            slip = round(records.scenario.links[f"{peer}->{name}"].delay_ms)
             assert (site.used[:, j] == np.maximum(np.arange(1000) - slip, -1)).all()
 
 
 # The initial history (L7).
 
 
-def test_before_its_first_sample_a_peer_rests_at_its_start() -> None:
-    made = run("free", {"duration_s": 1.0})
-    starts = {name: np.array(spec.q0_rad) for name, spec in made.scenario.sites.items()}
-    for name, site in made.sites.items():
-        a, b = (starts[p] for p in made.scenario.peers(name))
+def test_a_peer_first_rests_at_its_start() -> None:
+    records = run("free", {"duration_s": 1.0})
+    starts = {name: np.array(spec.q0_rad) for name, spec in records.scenario.sites.items()}
+    for name, site in records.sites.items():
+        a, b = (starts[p] for p in records.scenario.peers(name))
         assert (site.q_des[:200] == 0.5 * a + 0.5 * b).all()
         assert (site.qd_des[:200] == 0.0).all()
         assert (site.used[:200] == -1).all()

@@ -1,4 +1,4 @@
-"""The memory of links: what their delays need, more as it is needed, and at most what a site is given."""
+"""The memory of links grows with their delays up to the limit of a site."""
 
 from typing import Any
 
@@ -29,8 +29,8 @@ from trilat_net.scenario.run_changes import LinkTables, resolve_change
 MIB = 2**20
 
 
-def taken(arrays: SiteArrays) -> int:
-    """Bytes that all links of a site take for samples and their times."""
+def count_link_bytes(arrays: SiteArrays) -> int:
+    """Returns the bytes that all links of a site take for samples and their times."""
     waiting = 0 if arrays.channel is None else arrays.channel.waiting.nbytes
     return arrays.dues.nbytes + arrays.calendars.nbytes + waiting
 
@@ -47,7 +47,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("kind", SCENARIOS)
-def test_a_link_of_100_ms_takes_less_than_a_mebibyte(kind: str) -> None:
+def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
     """At 1 kHz and at 4 kHz, whatever the arms, the laws and the distribution."""
     source, changes = SCENARIOS[kind]
     for rate_hz in (1000, 4000):
@@ -57,8 +57,8 @@ def test_a_link_of_100_ms_takes_less_than_a_mebibyte(kind: str) -> None:
         for name in scenario.names:
             setup = scenario.setup(name)
             arrays = Site(setup)._arrays
-            assert taken(arrays) <= MIB * len(setup.links)
-            assert taken(arrays) == links_bytes(setup, arrays.calendars.shape[1])
+            assert count_link_bytes(arrays) <= MIB * len(setup.links)
+            assert count_link_bytes(arrays) == links_bytes(setup, arrays.calendars.shape[1])
 
 
 # Calendars that widen give what the widest give.
@@ -81,9 +81,7 @@ ORDERS = st.one_of(
 
 @pytest.mark.parametrize("rates", [(1000, 1000), (400, 900), (50, 1001)], ids=str)
 @given(data=st.data())
-def test_site_whose_links_widen_makes_records_of_one_with_widest(
-    rates: tuple[int, int], data: st.DataObject
-) -> None:
+def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataObject) -> None:
     """Senders up to ten seconds ahead and late by as much, out of order and twice, delays that change."""
     grown, widest = (
         linked(*rates, [LinkModel(location=1_000.0)]),
@@ -92,17 +90,20 @@ def test_site_whose_links_widen_makes_records_of_one_with_widest(
     widest = wide(widest, calendar_pages(rates[0]))
     first = grown._arrays.calendars.shape[1]
     now = 0
-    came = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
+    arrival_ticks = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
     for batch in data.draw(
-        st.lists(st.tuples(st.lists(came, max_size=5), ORDERS, st.integers(1, 900)), max_size=6)
+        st.lists(
+            st.tuples(st.lists(arrival_ticks, max_size=5), ORDERS, st.integers(1, 900)),
+            max_size=6,
+        )
     ):
         ahead, model, idle = batch
-        here = now * rates[1] // rates[0]
+        own_tick = now * rates[1] // rates[0]
         orders = []
         if model is not None:
             from_ns = (now + rates[0] // 10) * 10**9 // rates[0]
             orders = [CoreChange("order", 0, model._replace(from_ns=from_ns))]
-        tick = TickInput(now, [sample(max(here + m, 0)) for m in ahead], orders)
+        tick = TickInput(now, [sample(max(own_tick + m, 0)) for m in ahead], orders)
         assert grown.step(tick) == widest.step(tick)
         idly = [TickInput(now + n) for n in range(1, idle)]
         assert stepped(grown, idly) == stepped(widest, idly)
@@ -111,8 +112,8 @@ def test_site_whose_links_widen_makes_records_of_one_with_widest(
     assert first <= grown._arrays.calendars.shape[1] <= calendar_pages(rates[0])
 
 
-def test_a_delay_that_is_ordered_to_grow_loses_no_sample() -> None:
-    """From 1 ms to ten seconds: every sample that is sent comes into use when it is due."""
+def test_growing_delays_lose_no_sample() -> None:
+    """From 1 ms to ten seconds: every sent sample comes into use when it is due."""
     site = one_link(1000, 1000, 1_000_000)
     order = CoreChange("longer", 0, LinkModel(from_ns=1_000_000_000, location=9_999_000.0))
     ticks = (
@@ -125,8 +126,8 @@ def test_a_delay_that_is_ordered_to_grow_loses_no_sample() -> None:
     assert site.counts()[0].lost == site.counts()[0].refused == 0
 
 
-def test_what_is_under_way_survives_the_widening() -> None:
-    """Also what a law's peer sends, and of every peer."""
+def test_samples_on_their_way_survive_the_widening() -> None:
+    """This includes the numbers of a law's peer, for every peer."""
     scenario = load_scenario(
         "paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"}
     )
@@ -148,7 +149,7 @@ def test_what_is_under_way_survives_the_widening() -> None:
 
 
 def many(count: int, rate_hz: int, delay_ms: float) -> str:
-    """The text of so many sites, each of which follows the one before it."""
+    """Returns the text of so many sites, each of which follows the site before it."""
     names = [f"a{n}" for n in range(count)]
     sites = "".join(f"[sites.{name}]\n" for name in names)
     rows = "".join(
@@ -160,13 +161,13 @@ def many(count: int, rate_hz: int, delay_ms: float) -> str:
 @pytest.mark.parametrize(
     ("count", "rate_hz"), [(3, 4000), (8, 1000), (12, 1000), (12, 4000), (32, 1000)]
 )
-def test_what_virtual_time_takes_a_recorder_takes(count: int, rate_hz: int) -> None:
+def test_the_recorder_takes_virtual_runs(count: int, rate_hz: int) -> None:
     scenario = parse_scenario(many(count, rate_hz, 100.0))
     assert parse_embedded(scenario.text).names == scenario.names
-    assert taken(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
+    assert count_link_bytes(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
 
 
-def test_limit_has_same_words_wherever_scenario_comes_from() -> None:
+def test_limit_has_equal_words_in_all_scenarios() -> None:
     text = many(12, 20_000, 9000.0)
     problems = []
     for read in (parse_scenario, parse_embedded):
@@ -180,7 +181,7 @@ def test_limit_has_same_words_wherever_scenario_comes_from() -> None:
     assert problems[0][0] == "sites.a0"
 
 
-def test_change_that_would_need_more_than_limit_is_refused() -> None:
+def test_changes_beyond_the_limit_are_refused() -> None:
     scenario = parse_scenario(many(12, 20_000, 1.0))
     present = LinkTables(scenario.links, ())
     change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
@@ -189,8 +190,8 @@ def test_change_that_would_need_more_than_limit_is_refused() -> None:
         resolve_change(scenario, present, {**change, "to": {"delay_ms": 9000.0}}, 10**9)
 
 
-def test_links_stay_within_the_limit_and_count_the_rest() -> None:
-    """Of a site that is given less: stamps from further ahead are refused, all others come into use."""
+def test_limited_links_count_what_they_refuse() -> None:
+    """A site with less memory refuses stamps from further ahead; all others come into use."""
     setup = load_scenario("paper").setup("m1")
     assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
     free, tight = one_link(1000, 1000, 1_000_000), one_link(1000, 1000, 1_000_000)
@@ -208,7 +209,7 @@ def test_links_stay_within_the_limit_and_count_the_rest() -> None:
 
 
 def test_the_most_pages_are_within_the_limit() -> None:
-    """Where twenty seconds do not fit."""
+    """For a limit below twenty seconds."""
     setup = parse_scenario(many(12, 4000, 100.0)).setup("a0")
     pages = CalendarSizer(setup).most_pages
     assert needed_pages(setup) < pages < calendar_pages(4000)

@@ -1,4 +1,4 @@
-"""A live hand: who holds the arm, where its target is, and that nothing of it jumps."""
+"""A live hand: its holder, its target, and continuity of its force and target."""
 
 import math
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ ARM = (1.0, 0.5)
 def run(
     messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES
 ) -> list[HandStep]:
-    """Returns what a hand does in each tick, with the messages that come in before some of them."""
+    """Returns the hand's state in each tick, with the given messages before some ticks."""
     memory, steps = HandMemory(), []
     for k in range(ticks):
         step = advance_hand(
@@ -48,26 +48,26 @@ def run(
 
 
 def hands(steps: list[HandStep]) -> list[HandInForce]:
-    """Returns what is in force in each tick."""
+    """Returns the message in force in each tick."""
     return [HandInForce.read(step.vector) for step in steps]
 
 
-def at(
+def message_at(
     k: int, target: tuple[float, ...], n: int | None = None, **fields: Any
 ) -> dict[int, Any]:
     """Returns a message of hand 7 that comes at tick k."""
-    one = {
+    message = {
         "source": 7,
         "number": k if n is None else n,
         "grip": True,
         "target": target,
         "sent_ns": k * 10**6,
     }
-    return {k: [HandCommand(**{**one, **fields})]}
+    return {k: [HandCommand(**{**message, **fields})]}
 
 
-def test_it_begins_at_arm_without_force_and_its_grip_grows() -> None:
-    steps = run(at(10, (1.2, 0.5)), 150)
+def test_holds_begin_without_force_and_grow() -> None:
+    steps = run(message_at(10, (1.2, 0.5)), 150)
     before, first, *rest = hands(steps)[9:]
     assert before == HandInForce.read(empty_hand_vector(2))
     assert first.target == ARM
@@ -78,12 +78,14 @@ def test_it_begins_at_arm_without_force_and_its_grip_grows() -> None:
     assert grips[-1] == 1.0
 
 
-def test_between_two_messages_the_target_glides_in_a_straight_line() -> None:
-    """Sixty messages a second of a hand that moves at 0.6 m/s: the target moves at 0.6 m/s, and no step."""
+def test_the_target_glides_linearly_between_messages() -> None:
+    """Sixty messages a second of a hand that moves at 0.6 m/s: the target moves at 0.6 m/s
+    without steps.
+    """
     messages: dict[int, Any] = {}
     for n in range(60):
         k = round(n * 1000 / 60)
-        messages |= at(k, (1.0 + 0.6 * k / 1000, 0.5))
+        messages |= message_at(k, (1.0 + 0.6 * k / 1000, 0.5))
     moved = np.array([hand.target[0] for hand in hands(run(messages, 1000))])
     speed = np.diff(moved)[200:] * 1000
     assert speed == pytest.approx(0.6, abs=0.05)
@@ -91,14 +93,14 @@ def test_between_two_messages_the_target_glides_in_a_straight_line() -> None:
 
 
 def test_the_speed_of_the_target_is_limited() -> None:
-    steps = hands(run(at(0, (50.0, 0.5)), 180))
+    steps = hands(run(message_at(0, (50.0, 0.5)), 180))
     rates = [math.hypot(*hand.rate) for hand in steps]
     assert max(rates) == pytest.approx(1.5)
     assert steps[-1].target[0] == pytest.approx(1.0 + 1.5 * 0.179)
 
 
 def test_a_silent_hand_lets_go_and_fades() -> None:
-    steps = run(at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0), 500)
+    steps = run(message_at(0, (1.1, 0.5)) | message_at(150, (1.1, 0.5), n=0), 500)
     held = hands(steps)
     changes = {k: step.changes for k, step in enumerate(steps) if step.changes}
     last_ns = SILENCE_NS + 150_000_000
@@ -110,13 +112,13 @@ def test_a_silent_hand_lets_go_and_fades() -> None:
     assert {hand.rate for hand in fading} == {(0.0, 0.0)}
 
 
-def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
-    release = at(50, (), n=50, grip=False)
+def test_the_next_holder_follows_a_release() -> None:
+    release = message_at(50, (), n=50, grip=False)
     second = {
         40: [HandCommand(9, 0, True, (2.0, 2.0), 0)],
         160: [HandCommand(9, 1, True, (1.0, 0.6), 0)],
     }
-    steps = run(at(0, (1.1, 0.5)) | release | second, 200)
+    steps = run(message_at(0, (1.1, 0.5)) | release | second, 200)
     assert steps[40].refused == (ANOTHER_HOLDS,)
     assert steps[50].changes == ((7, RELEASED),)
     assert steps[160].changes == ((9, TAKEN),)
@@ -127,14 +129,15 @@ def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
 
 @pytest.mark.parametrize("source", [7, 9], ids=["the same", "another"])
 @pytest.mark.parametrize("starts_at_arm", [True, False], ids=["a target", "a force"])
-def test_who_takes_hold_of_fading_grip_goes_on_from_it(
-    source: int, starts_at_arm: bool
-) -> None:
+def test_a_new_holder_continues_a_fading_grip(source: int, starts_at_arm: bool) -> None:
     """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
     rules = RULES._replace(starts_at_arm=starts_at_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
     steps = run(
-        at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0) | at(199, (), grip=False) | again,
+        message_at(0, (1.1, 0.5))
+        | message_at(150, (1.1, 0.5), n=0)
+        | message_at(199, (), grip=False)
+        | again,
         400,
         rules,
     )
@@ -148,25 +151,25 @@ def test_who_takes_hold_of_fading_grip_goes_on_from_it(
     assert grips[-1] == 1.0
 
 
-def test_a_message_that_was_overtaken_changes_nothing() -> None:
-    """Also one that comes after the same hand has let go: it does not take hold again."""
+def test_an_overtaken_message_changes_nothing() -> None:
+    """A message that comes after the same hand has let go does not take hold again either."""
     late = {
         30: [HandCommand(7, 5, True, (9.0, 9.0), 0)],
         70: [HandCommand(7, 49, True, (9.0, 9.0), 0)],
     }
-    steps = run(at(10, (1.1, 0.5)) | at(50, (), n=50, grip=False) | late, 200)
+    steps = run(message_at(10, (1.1, 0.5)) | message_at(50, (), n=50, grip=False) | late, 200)
     assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
     assert steps[-1].vector == empty_hand_vector(2)
 
 
-def test_hand_that_wakes_up_takes_hold_again_with_same_goal() -> None:
-    steps = run(at(0, (1.1, 0.5)) | at(400, (1.1, 0.5), n=0), 402)
+def test_a_silent_hand_resumes_its_goal() -> None:
+    steps = run(message_at(0, (1.1, 0.5)) | message_at(400, (1.1, 0.5), n=0), 402)
     assert [change for step in steps for _, change in step.changes] == [TAKEN, SILENT, TAKEN]
 
 
 def test_a_force_begins_at_zero() -> None:
     rules = HandRules(size=2, rate_hz=1000, starts_at_arm=False)
-    steps = hands(run(at(0, (8.0, 0.0)), 120, rules))
+    steps = hands(run(message_at(0, (8.0, 0.0)), 120, rules))
     assert steps[0].target == (0.0, 0.0)
     assert steps[-1].target == pytest.approx((8.0, 0.0))
 
@@ -183,7 +186,7 @@ COMMANDS = st.builds(
 
 @settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
-def test_a_grip_never_jumps_and_its_target_keeps_its_limit(messages: Any) -> None:
+def test_grips_are_continuous_and_targets_limited(messages: Any) -> None:
     steps = hands(run(messages, 500))
     most = 1e6 / GRIP_NS + 1e-12
     for before, now in pairwise(steps):
@@ -209,10 +212,13 @@ H_S = 1e-3
     acceleration=st.floats(0.1, 100.0),
     h_s=st.sampled_from([1e-4, 1e-3, 5e-3]),
 )
-def test_the_way_from_the_stopping_speed_is_the_distance(
+def test_stopping_distance_matches_stopping_speed(
     speed: float, acceleration: float, h_s: float
 ) -> None:
-    """Eq. (L1): the ways of ticks at v, v - a h, ... add up to the distance whose stopping speed v is."""
+    """Eq.
+
+    (L1): the ways of ticks at v, v - a h, ... add up to the distance whose stopping speed v is.
+    """
     step = acceleration * h_s
     ways = [h_s * (speed - n * step) for n in range(int(speed / step) + 1)]
     assert find_stopping_speed(sum(ways), acceleration, h_s) == pytest.approx(speed, rel=1e-9)
@@ -221,7 +227,7 @@ def test_the_way_from_the_stopping_speed_is_the_distance(
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
 def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
-    """Also where one lets go, is silent, or takes hold of a grip that fades."""
+    """Also for messages that let go, fall silent, or take over a fading grip."""
     steps = hands(run(messages, 600, LIMITED))
     assert all(math.hypot(*now.rate) <= 1.5 + 1e-9 for now in steps)
     for before, now in pairwise(steps):
@@ -233,14 +239,14 @@ def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
 
 @settings(max_examples=12, deadline=None)
 @given(goal=st.tuples(st.floats(-1.0, 3.0), st.floats(-1.0, 2.0)), limit=st.floats(5.0, 200.0))
-def test_target_comes_to_rest_at_still_goal_without_overshoot(
+def test_targets_reach_still_goals_without_overshoot(
     goal: tuple[float, float], limit: float
 ) -> None:
     rules = RULES._replace(acceleration_limit=limit)
     way = [x - start for x, start in zip(goal, ARM, strict=True)]
     distance = math.hypot(*way)
     # a hand repeats its last message while nothing changes
-    messages = {k: at(k, goal, n=0)[k] for k in range(0, 3000, 50)}
+    messages = {k: message_at(k, goal, n=0)[k] for k in range(0, 3000, 50)}
     steps = hands(run(messages, 3000, rules))
     for now in steps:
         moved = [x - start for x, start in zip(now.target, ARM, strict=True)]
@@ -251,9 +257,13 @@ def test_target_comes_to_rest_at_still_goal_without_overshoot(
     assert math.hypot(*steps[-1].rate) < 1e-9
 
 
-def test_target_passes_a_goal_that_comes_back_by_its_stopping_way() -> None:
-    messages = at(0, (4.0, 0.5)) | at(199, (4.0, 0.5), n=0) | at(200, (1.1, 0.5))
-    messages |= {k: at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
+def test_targets_overshoot_returning_goals_by_stopping_distance() -> None:
+    messages = (
+        message_at(0, (4.0, 0.5))
+        | message_at(199, (4.0, 0.5), n=0)
+        | message_at(200, (1.1, 0.5))
+    )
+    messages |= {k: message_at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
     steps = hands(run(messages, 2000, LIMITED))
     way = max(now.target[0] for now in steps) - steps[200].target[0]
     assert 0.0 < way <= 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
@@ -262,15 +272,15 @@ def test_target_passes_a_goal_that_comes_back_by_its_stopping_way() -> None:
 
 
 @pytest.mark.parametrize("gap", [10, 25, 60, 150])
-def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
+def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
     """A hand at 0.3 m/s whose states come in bursts: its spring and damper change by 0.85 N in a tick."""
     stiffness_n_m, damping_n_s_m = 300.0, 20.0
     messages: dict[int, Any] = {}
     for k in range(0, 3000, 10):
-        place = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
+        tip_m = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
         # every other 100 ms the machine hands over late
         arrives = k + gap if (k // 100) % 2 else k
-        messages.setdefault(arrives - arrives % gap, []).extend(at(k, place)[k])
+        messages.setdefault(arrives - arrives % gap, []).extend(message_at(k, tip_m)[k])
     for limits, least, most in ((LIMITED, 0.0, 0.85), (RULES, 0.0 if gap == 10 else 2.0, 40.0)):
         steps = hands(run(messages, 3000, limits))
         force = [
@@ -284,7 +294,7 @@ def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
 # The reach of an arm
 
 
-def test_goals_beyond_reach_move_to_its_nearest_place() -> None:
+def test_goals_beyond_reach_move_to_nearest_place() -> None:
     ring = HandReach((0.0, 0.0), 0.5, 2.0)
     assert ring.find_nearest((3.0, 4.0)) == pytest.approx((1.2, 1.6))
     assert ring.find_nearest((0.0, 0.1)) == pytest.approx((0.0, 0.5))
@@ -297,7 +307,7 @@ def test_goals_beyond_reach_move_to_its_nearest_place() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=2), max_size=30))
-def test_target_never_leaves_the_reach_by_more_than_it_takes_to_stop(messages: Any) -> None:
+def test_targets_leave_reach_by_stopping_distance_only(messages: Any) -> None:
     rules = LIMITED._replace(reach=HandReach((0.0, 0.0), 0.0, 2.0))
     steps = hands(run(messages, 500, rules))
     stopping_m = 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0

@@ -30,7 +30,9 @@ RULE = {
 
 
 def scenario(*cuts: str, **more: Any) -> Scenario:
-    """The paper's, with a delay of 100 ms; links that are cut lose what is stamped from 3 s to 4 s."""
+    """Returns the paper's scenario with a delay of 100 ms; cut links lose samples stamped from
+    3 s to 4 s.
+    """
     outages = {f"links.{cut}.outages_s": [[3.0, 4.0]] for cut in cuts}
     return load_scenario(
         "paper", {**RULE, "duration_s": 6.0, "link.delay_ms": 100.0, **outages, **more}
@@ -39,16 +41,16 @@ def scenario(*cuts: str, **more: Any) -> Scenario:
 
 @functools.cache
 def master_lost() -> Log:
-    """m1 is not heard by anybody for a second."""
+    """Returns a run in which no site hears m1 for a second."""
     return trilat_net.simulate(scenario("m1->s", "m1->m2"))
 
 
-def test_a_lost_masters_shares_go_to_the_others_and_return() -> None:
-    """The last sample of before comes into use at 3.099 s, the first of after at 4.1 s."""
+def test_lost_masters_shares_go_over_and_return() -> None:
+    """The last sample before the cut comes into use at 3.099 s, the first after it at 4.1 s."""
     log = master_lost()
     part, other = log["s"], log["m2"]
-    found = reasons(log, "s")[-4:]
-    assert found == [
+    modes = reasons(log, "s")[-4:]
+    assert modes == [
         ("return", LifeReason.DROPPED),
         ("run", LifeReason.ALIGNED),
         ("return", LifeReason.RESTORED),
@@ -65,7 +67,7 @@ def test_a_lost_masters_shares_go_to_the_others_and_return() -> None:
     assert set(log["m1"].mode[400:]) == {"run"}  # it hears everybody
 
 
-def test_reference_does_not_jump_when_master_is_lost_and_back() -> None:
+def test_losing_a_master_never_jumps_the_reference() -> None:
     part, h_s = master_lost()["s"], 1e-3
     stale = slice(3099, 3120)  # what is in use stays meanwhile, and so does its rate
     steps = np.diff(part.q_des, axis=0) - 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
@@ -75,7 +77,7 @@ def test_reference_does_not_jump_when_master_is_lost_and_back() -> None:
 
 
 @pytest.mark.long
-def test_it_is_executed_again_and_its_energies_close() -> None:
+def test_degraded_runs_verify_and_close_their_energies() -> None:
     log = master_lost()
     assert verify(log).identical == 18_000
     assert compare_with_virtual(log).fed.identical == 18_000
@@ -91,11 +93,15 @@ def test_it_is_executed_again_and_its_energies_close() -> None:
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
     losses = [(site, peer, round(a, 2), round(b, 2)) for site, peer, a, b in list_losses(log)]
     assert losses == [("m2", "m1", 3.12, 4.35), ("s", "m1", 3.12, 4.35)]
-    (premise,) = (one for one in trilat_net.certify(log).premises if one.name == "shares")
+    (premise,) = (
+        premise_found
+        for premise_found in trilat_net.certify(log).premises
+        if premise_found.name == "shares"
+    )
     assert "s without m1 3.12 to 4.35 s; the remaining sites follow each other" in premise.text
 
 
-def test_last_that_is_followed_and_slave_are_waited_for() -> None:
+def test_the_last_master_and_slave_are_awaited() -> None:
     for cuts in (("m1->s", "m2->s"), ("s->m1", "s->m2")):
         log = trilat_net.simulate(scenario(*cuts, duration_s=5.0))
         for site in {cut.partition(">")[2] for cut in cuts}:
@@ -105,8 +111,8 @@ def test_last_that_is_followed_and_slave_are_waited_for() -> None:
         assert list_losses(log) == []
 
 
-def test_nobody_is_dropped_without_whom_the_others_are_no_group() -> None:
-    """m2 follows m1 alone: without m1 it follows nobody, and s would be led by an arm that stands still."""
+def test_indispensable_peers_are_never_dropped() -> None:
+    """m2 follows m1 alone: without m1 it would follow nobody, and an arm that stands still would lead s."""
     chain = {"dominance.m2": {"m1": 1.0}, "dominance.m1": {"m2": 0.5, "s": 0.5}}
     log = trilat_net.simulate(scenario("m1->s", duration_s=5.0, **chain))
     assert (log["s"].mode[3120:4100] == "hold").all()
@@ -114,15 +120,15 @@ def test_nobody_is_dropped_without_whom_the_others_are_no_group() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "overrides", "words"),
+    ("name", "overrides", "phrase"),
     [
         ("two_sites", RULE, "no site can go on without a master"),
         ("paper", {"on_stale.on_lost": "degrade"}, "needs on_stale.action = 'glide'"),
         ("paper", {**RULE, "on_stale.on_lost": "drop"}, "'hold' or 'degrade'"),
     ],
 )
-def test_a_rule_that_cannot_be_kept_is_refused(
-    name: str, overrides: dict[str, Any], words: str
+def test_an_impossible_rule_is_refused(
+    name: str, overrides: dict[str, Any], phrase: str
 ) -> None:
-    with pytest.raises(ScenarioError, match=words):
+    with pytest.raises(ScenarioError, match=phrase):
         load_scenario(name, overrides)

@@ -1,4 +1,6 @@
-"""A hand of one's own acts a fixed time after what it saw, whenever its decision comes (L2 for hands)."""
+"""A user's own hand acts a fixed time after its observation, however long its decision takes
+(L2 for hands).
+"""
 
 import math
 from collections.abc import Sequence
@@ -27,19 +29,19 @@ def acted(hand: OwnHand, k: int) -> HandInForce:
 def run(
     decisions: dict[int, tuple[int, Sequence[float] | None]], delay: int = DELAY
 ) -> list[HandInForce]:
-    """Returns what a hand does at every tick, of decisions by the tick at which they come."""
+    """Returns the hand's state at every tick, for decisions by the tick at which they come."""
     hand = make_hand(delay)
-    found = []
+    hand_states = []
     for k in range(TICKS):
         for asked, goal in (one for at, one in decisions.items() if at == k):
             hand.accept_decision(asked, goal)
-        found.append(acted(hand, k))
-    return found
+        hand_states.append(acted(hand, k))
+    return hand_states
 
 
 @given(st.lists(st.integers(0, DELAY), min_size=5, max_size=5))
 def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
-    """Each comes after another time of thinking, and not later than its delay."""
+    """Each decision takes another computing time, no longer than the hand's delay."""
     goals = {EVERY * n: (0.5 + 0.01 * n, -0.25) for n in range(5)}
     prompt = run({asked: (asked, goal) for asked, goal in goals.items()})
     pairs = zip(goals.items(), thinks, strict=True)
@@ -50,36 +52,36 @@ def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
             in_order[came] = asked, goal
     later = run(in_order)
     first = min(in_order)
-    assert [one.number for one in later[:first]] == [-1] * first
+    assert [state.number for state in later[:first]] == [-1] * first
     if len(in_order) == len(goals):
         assert later == prompt
 
 
-def test_it_takes_hold_after_its_delay() -> None:
-    found = run({0: (0, (0.6, -0.25))})
-    held = [k for k, one in enumerate(found) if one.source == PROGRAM]
+def test_hands_take_hold_after_their_delay() -> None:
+    hand_states = run({0: (0, (0.6, -0.25))})
+    held = [k for k, state in enumerate(hand_states) if state.source == PROGRAM]
     assert held[0] == DELAY
-    assert found[DELAY].target == PLACE
+    assert hand_states[DELAY].target == PLACE
 
 
 def test_a_decision_that_is_late_acts_at_once() -> None:
-    found = run({DELAY + 7: (0, (0.6, -0.25))})
-    assert [one.source for one in found[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
+    hand_states = run({DELAY + 7: (0, (0.6, -0.25))})
+    assert [state.source for state in hand_states[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
 
 
-def test_an_older_decision_is_passed_over() -> None:
+def test_an_older_decision_is_ignored() -> None:
     both = run({25: (20, (0.6, -0.25)), 26: (0, (9.0, 9.0))})
     assert both == run({25: (20, (0.6, -0.25))})
 
 
-def test_none_lets_go_and_the_grip_fades() -> None:
-    found = run({n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)})
-    assert found[200 + DELAY].source == 0
-    assert 0.0 < found[200 + DELAY].grip <= 1.0
-    assert found[200 + DELAY + 101].grip == 0.0
+def test_without_decision_the_grip_fades() -> None:
+    hand_states = run({n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)})
+    assert hand_states[200 + DELAY].source == 0
+    assert 0.0 < hand_states[200 + DELAY].grip <= 1.0
+    assert hand_states[200 + DELAY + 101].grip == 0.0
 
 
-def test_it_says_when_it_needs_the_arm() -> None:
+def test_hands_say_when_they_need_the_arm() -> None:
     hand = make_hand(delay=50)
     assert [hand.find_next_event(k) for k in (0, 19, 20)] == [20, 20, 40]
     hand.accept_decision(0, (0.6, -0.25))
@@ -96,7 +98,7 @@ def test_it_says_when_it_needs_the_arm() -> None:
         ((80.0, 80.0), "norm of 113.137, but at most 100 is accepted"),
     ],
 )
-def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -> None:
+def test_an_invalid_goal_is_refused(goal: tuple[float, ...], problem: str) -> None:
     hand = make_hand()
     with pytest.raises(ValueError, match=problem):
         hand.accept_decision(0, goal)
@@ -113,13 +115,13 @@ def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -
     st.floats(0.05, 2.0),
     st.just(math.inf) | st.floats(1.0, 100.0),
 )
-def test_compiled_spans_are_the_ticks_bit_for_bit(
+def test_compiled_spans_equal_ticks_bit_for_bit(
     goals: list[tuple[float, float] | None],
     delay: int,
     speed_limit: float,
     acceleration_limit: float,
 ) -> None:
-    """Goals come at every 20th tick, and then none for longer than a silence that lets go."""
+    """Goals come at every 20th tick, and then stop for longer than the silence that lets go."""
     rules = HandRules(
         2,
         1000,

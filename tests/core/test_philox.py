@@ -13,7 +13,7 @@ from trilat_net.core.links.philox import link_key, philox, uniforms, unit_interv
 words = st.integers(0, U32)
 
 
-def drawn(counter: tuple[int, ...], key: tuple[int, int]) -> list[int]:
+def draw_words(counter: tuple[int, ...], key: tuple[int, int]) -> list[int]:
     return [int(word) for word in philox(*map(np.uint64, (*counter, *key)))]
 
 
@@ -33,13 +33,13 @@ def test_the_known_answers_of_random123(
     counter: tuple[int, ...], key: tuple[int, int], answer: tuple[int, ...]
 ) -> None:
     """philox4x32-10 of the library's kat_vectors."""
-    assert drawn(counter, key) == list(answer)
+    assert draw_words(counter, key) == list(answer)
     assert philox_in_integers(counter, key) == list(answer)
 
 
 @given(counter=st.tuples(words, words, words, words), key=st.tuples(words, words))
 def test_any_counter_and_key_as_defined(counter: tuple[int, ...], key: tuple[int, int]) -> None:
-    assert drawn(counter, key) == philox_in_integers(counter, key)
+    assert draw_words(counter, key) == philox_in_integers(counter, key)
 
 
 @given(
@@ -48,7 +48,7 @@ def test_any_counter_and_key_as_defined(counter: tuple[int, ...], key: tuple[int
     purpose=words,
     attempt=st.integers(0, 63),
 )
-def test_uniforms_are_words_of_their_own_place(
+def test_uniforms_follow_from_their_place(
     key: int, sample: int, purpose: int, attempt: int
 ) -> None:
     a, b, c, d = philox_in_integers(

@@ -1,4 +1,4 @@
-"""A play-out buffer turns jitter below its budget into a constant delay, bit for bit; whole runs."""
+"""A play-out buffer makes jitter below its budget a constant delay, bit for bit; whole runs."""
 
 from typing import Any
 
@@ -38,12 +38,12 @@ def same_bits(a: Run, b: Run) -> bool:
 
 
 @pytest.mark.parametrize("name", BELOW)
-def test_jitter_below_budget_is_constant_delay_bit_for_bit(name: str) -> None:
+def test_jitter_below_budget_is_constant_bit_for_bit(name: str) -> None:
     over = {"duration_s": 2.0}
     constant = run("free", {**over, "link.delay_ms": BUDGET_MS})
-    made = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})
-    assert same_bits(made, constant)
-    assert made.stack("used").max() == 2000 - 1 - 200
+    buffered = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})
+    assert same_bits(buffered, constant)
+    assert buffered.stack("used").max() == 2000 - 1 - 200
 
 
 def trajectory(scenario: str, overrides: dict[str, Any]) -> Run:
@@ -51,22 +51,22 @@ def trajectory(scenario: str, overrides: dict[str, Any]) -> Run:
 
 
 @pytest.mark.long
-def test_it_holds_to_the_end_of_the_paper() -> None:
+def test_play_out_holds_throughout_the_paper() -> None:
     link = {"model": "gamma", "delay_ms": 60.0, "deviation_ms": 10.0, "playout_ms": BUDGET_MS}
     assert same_bits(trajectory("paper", {"link": link}), run("paper"))
 
 
-def test_jitter_above_the_budget_is_not() -> None:
+def test_jitter_above_budget_varies() -> None:
     link = {
         "model": "uniform",
         "delay_ms": 150.0,
         "half_width_ms": 100.0,
         "playout_ms": BUDGET_MS,
     }
-    made = trajectory("free", {"link": link, "duration_s": 2.0})
+    buffered = trajectory("free", {"link": link, "duration_s": 2.0})
     constant = run("free", {"duration_s": 2.0, "link.delay_ms": BUDGET_MS})
-    assert not same_bits(made, constant)
-    assert (np.diff(made.stack("used"), axis=1) >= 0).all()
+    assert not same_bits(buffered, constant)
+    assert (np.diff(buffered.stack("used"), axis=1) >= 0).all()
 
 
 def outputs(overrides: dict[str, Any]) -> list[TickRecord]:
@@ -78,7 +78,7 @@ def outputs(overrides: dict[str, Any]) -> list[TickRecord]:
     ]
 
 
-def test_even_the_arrivals_checksums_agree() -> None:
-    """All that a record of virtual time holds, not the numbers of the trajectory alone."""
+def test_arrival_checksums_agree() -> None:
+    """The whole records of virtual time agree, beyond the numbers of the trajectory."""
     held = outputs({"link": {**BELOW["uniform"], "playout_ms": BUDGET_MS}})
     assert held == outputs({"link.delay_ms": BUDGET_MS})

@@ -1,4 +1,4 @@
-"""Laws plugged into a tick: what they see and send; the compiled form gives the bits of the plain one."""
+"""Laws plugged into a tick: their inputs and messages; the compiled form has the bits of the plain form."""
 
 import csv
 import math
@@ -30,7 +30,7 @@ def linked(law: str, name: str = "asymmetric", **more: Any) -> Scenario:
 
 
 def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRecord]]:
-    """Every sample arrives at the next tick, with the part of `ch` that is the receiver's."""
+    """Runs ticks in which every sample arrives at the next tick, with the receiver's part of `ch`."""
     setups = {name: scenario.setup(name) for name in scenario.names}
     sites = {name: Site(setup) for name, setup in setups.items()}
     records: dict[str, list[TickRecord]] = {name: [] for name in sites}
@@ -45,7 +45,7 @@ def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRe
     return records
 
 
-def test_a_compiled_law_gives_the_bits_of_the_plain_one() -> None:
+def test_compiled_laws_give_the_plain_bits() -> None:
     a, b = (
         run_by_hand(linked(f"tests.plugged_laws:{law}")) for law in ("Line", "CompiledLine")
     )
@@ -57,7 +57,7 @@ def test_a_compiled_law_gives_the_bits_of_the_plain_one() -> None:
 
 
 class Watching:
-    """Keeps what it saw; follows nobody."""
+    """A law that keeps its inputs and follows nobody."""
 
     remembers = ()
     needs_model = True
@@ -71,12 +71,12 @@ class Watching:
             now.tau[i] = 3.0 * (i + 1) + now.k
 
 
-def test_a_law_sees_peers_external_torque_and_its_past() -> None:
+def test_laws_see_peers_external_torque_and_past() -> None:
     pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
     scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
-    made: list[Watching] = []
+    laws: list[Watching] = []
     setup = scenario.setup("m1")._replace(
-        law_factory=lambda facts: made.append(Watching(facts)) or made[-1]
+        law_factory=lambda facts: laws.append(Watching(facts)) or laws[-1]
     )
     site, records = Site(setup), []
     for k in range(20):
@@ -86,7 +86,7 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
             else []
         )
         records.append(site.step(TickInput(k, arrived)))
-    for k, now in enumerate(made[0].seen):
+    for k, now in enumerate(laws[0].seen):
         peer = now.peers[1]
         released = [m for m in range(2, 20, 4) if m + 5 <= k]  # 5 ms are 5 ticks
         assert peer.tick == (released[-1] if released else -1)
@@ -98,8 +98,8 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
         assert now.tau_before == (before.tau if before else [0.0, 0.0])
         assert now.q_before == (before.q if before else list(setup.q0))
         assert now.peers[0].tick == -1
-    assert any(now.tau_x != [0.0, 0.0] for now in made[0].seen)
-    now = made[0].seen[7]
+    assert any(now.tau_x != [0.0, 0.0] for now in laws[0].seen)
+    now = laws[0].seen[7]
     th1, th2, th3, th4, th5 = setup.theta
     c2, s2 = math.cos(now.q[1]), math.sin(now.q[1])
     outer = setup.g_m_s2 * th5 * math.cos(now.q[0] + now.q[1])
@@ -114,7 +114,7 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
 
 
 class Torques:
-    """Holds its arm by a spring, and keeps the torques that it sees."""
+    """A law that holds its arm by a spring, and keeps the torques that it sees."""
 
     seen: ClassVar[dict[str, list[Any]]] = {}
 
@@ -143,8 +143,8 @@ def _read_signs() -> dict[str, float]:
     return signs
 
 
-def test_torques_that_a_law_sees_have_the_signs_of_the_pages() -> None:
-    """The operator of m1 pushes with a constant 2 and 3 N m ON its arm; nobody else does."""
+def test_torques_have_the_documented_signs() -> None:
+    """The operator of m1 pushes with a constant 2 and 3 N m ON its arm; no other hand acts."""
     push = np.array([2.0, 3.0])
     Torques.seen.clear()
     run = trilat_net.simulate(
@@ -180,7 +180,7 @@ def test_names_of_several_senders_are_joined() -> None:
     a = LawChannel((SentVector("E", "J", 1), SentVector("u", "", 2, True)), 2)
     b = LawChannel((SentVector("F", "N m", 2), SentVector("E", "J", 1)), 2)
     vectors = join_received([a, b])
-    assert [one.name for one in vectors] == ["E", "u", "F"]
+    assert [vector.name for vector in vectors] == ["E", "u", "F"]
     assert a.find_columns(vectors) == [0, 1, 2, -1, -1]
     assert b.find_columns(vectors) == [2, -1, -1, 0, 1]
     with pytest.raises(ValueError, match="E with different lengths, 1 and 3 numbers"):
@@ -199,13 +199,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("law", REFUSED)
-def test_what_numba_does_not_take_is_refused_with_its_reason(law: str) -> None:
+def test_code_unsuitable_for_numba_is_refused(law: str) -> None:
     with pytest.raises(ScenarioError, match=REFUSED[law]) as caught:
         Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
     assert caught.value.path == "sites.s.control.law"
 
 
-def test_a_law_may_lack_memory_and_its_vectors_have_arithmetic() -> None:
+def test_a_law_may_lack_memory_with_vectors() -> None:
     whole, parts = (
         trilat_net.simulate(
             "two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.2
@@ -219,7 +219,7 @@ def test_a_law_may_lack_memory_and_its_vectors_have_arithmetic() -> None:
 
 
 @pytest.mark.parametrize("law", ["Sums", "SumsEach"])
-def test_a_law_with_memory_says_so(law: str) -> None:
+def test_a_law_with_memory_is_recognised(law: str) -> None:
     with pytest.raises(
         ScenarioError, match=rf"{law} writes self.sums: .* remembers = \('sums',\)"
     ):
@@ -253,7 +253,7 @@ def test_arithmetic_of_vectors_is_that_of_arrays(
     assert total == (2 * (np.array(a) + np.array(b))).tolist()
 
 
-def test_arithmetic_that_vectors_lack_says_what_has_it() -> None:
+def test_missing_vector_arithmetic_names_the_alternative() -> None:
     for law, fact in (
         ("Squares", "as in numpy.asarray"),
         ("Mismatched", "cannot combine a vector of 2 numbers with a vector of 3"),
@@ -271,7 +271,7 @@ FAILING = {
 
 
 @pytest.mark.parametrize("law", FAILING)
-def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
+def test_failing_compiled_laws_name_their_tick(law: str) -> None:
     site, (tick, problem) = (
         Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s")),
         FAILING[law],
@@ -283,8 +283,8 @@ def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
 
 
 @pytest.mark.long
-def test_on_chain_plain_compiled_and_fused_have_same_bits() -> None:
-    """Its inertia, bias and gravity are used."""
+def test_chain_laws_have_equal_bits_everywhere() -> None:
+    """The law uses inertia, bias and gravity."""
     scenarios = [
         linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")
     ]

@@ -32,10 +32,11 @@ PEERS = Rotation.from_rotvec([-0.2, 0.5, 1.4])
 def drive(
     spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks: int
 ) -> dict[str, Array]:
-    """The reference of a site whose peers turn with this angular velocity, and are heard in some ticks.
+    """Returns the reference of a site whose peers turn with this angular velocity, and are
+    heard in some ticks.
 
-    While they are not, their reference stays where it was, as a sample in use does. The arm is where its
-    reference is, and comes to rest within 0.1 s.
+    In other ticks their reference stays constant, as a sample in use does. The arm stands at
+    its reference, and comes to rest within 0.1 s.
     """
     arrays = build(POSE)
     s: Row = arrays.site[0]
@@ -54,9 +55,9 @@ def drive(
         if any(first <= k < end for first, end in heard):
             link.used, link.used_ns, last = k, t_ns, k
         s.q_followed, s.qd_followed = np.array(s.q_des), np.array(s.qd_des)
-        there = Rotation.from_rotvec(np.array(spin) * last * 1e-3) * PEERS
+        last_pose = Rotation.from_rotvec(np.array(spin) * last * 1e-3) * PEERS
         s.q_des[:3], s.qd_des[:3] = 0.05, 0.0
-        s.q_des[3:], s.qd_des[3:] = there.as_rotvec(), spin
+        s.q_des[3:], s.qd_des[3:] = last_pose.as_rotvec(), spin
         update_session_life(t_ns, s, arrays.links)
         if rests(s):
             rate = np.array(s.xd[3:]) * max(
@@ -68,7 +69,7 @@ def drive(
             s.x[3:], s.xd[3:] = moved.as_rotvec(), rate
         else:
             s.x[3:], s.xd[3:] = s.q_des[3:], s.qd_des[3:]
-        rows.append((s.mode, *s.q_des[3:], *s.qd_des[3:], *there.as_rotvec()))
+        rows.append((s.mode, *s.q_des[3:], *s.qd_des[3:], *last_pose.as_rotvec()))
     table = np.array(rows)
     return {
         "mode": table[:, 0],
@@ -79,13 +80,13 @@ def drive(
 
 
 def steps(turns: Array) -> Array:
-    """The turn from each orientation to the next."""
-    found = Rotation.from_rotvec(turns.copy())
-    return np.asarray((found[1:] * found[:-1].inv()).as_rotvec())
+    """Returns the turn from each orientation to the next."""
+    rotations = Rotation.from_rotvec(turns.copy())
+    return np.asarray((rotations[1:] * rotations[:-1].inv()).as_rotvec())
 
 
 @pytest.mark.long
-def test_the_way_to_peers_is_the_shortest_allowed_turn() -> None:
+def test_arms_take_the_shortest_allowed_turn() -> None:
     run = drive((0.0, 0.0, 0.0), [(50, 5000)], 4000)
     aligning = np.flatnonzero(run["mode"] == Mode.RETURN)
     way = (OWN * PEERS.inv()).magnitude()
@@ -93,14 +94,14 @@ def test_the_way_to_peers_is_the_shortest_allowed_turn() -> None:
     assert len(aligning) == int(np.ceil(takes))
     x = (aligning - aligning[0]) / takes
     wanted = Slerp([0.0, 1.0], Rotation.concatenate([OWN, PEERS]))(x * x * (3.0 - 2.0 * x))
-    found = Rotation.from_rotvec(run["turn"][aligning])
-    assert (found * wanted.inv()).magnitude().max() <= 1e-12
+    rotations = Rotation.from_rotvec(run["turn"][aligning])
+    assert (rotations * wanted.inv()).magnitude().max() <= 1e-12
     assert np.linalg.norm(run["rate"], axis=1).max() == pytest.approx(SPEED, rel=1e-6)
 
 
 @pytest.mark.long
-def test_neither_orientation_nor_velocity_jumps_while_peers_fall_silent() -> None:
-    """Waits, aligns, follows, holds, and is back over a long way: to the third order of the tick."""
+def test_silent_peers_never_make_orientations_jump() -> None:
+    """Waits, aligns, follows, holds, and returns over a long way: to the third order of the tick."""
     spin = (0.7, -1.1, 0.6)
     run = drive(spin, [(50, 3500), (4600, 9000), (9100, 12000)], 12000)
     modes = run["mode"].astype(int)
@@ -119,15 +120,15 @@ def test_neither_orientation_nor_velocity_jumps_while_peers_fall_silent() -> Non
     assert np.ptp(run["turn"][3630:4600], axis=0).max() <= 1e-12
     assert holding[3521:4600].all()
     following = modes == Mode.RUN
-    apart = (
+    distances = (
         Rotation.from_rotvec(run["turn"][following])
         * Rotation.from_rotvec(run["peers"][following]).inv()
     )
-    assert apart.magnitude().max() <= 1e-12
+    assert distances.magnitude().max() <= 1e-12
 
 
 @pytest.mark.long
-def test_farther_than_limit_is_not_gone_to_by_whole_turn() -> None:
+def test_limits_on_turns_are_never_bypassed() -> None:
     """1.8 rad about an axis askew, of which no coordinate is above 1.1 rad."""
     arrays = build(POSE)
     s: Row = arrays.site[0]
@@ -157,7 +158,7 @@ outages_s = [[2.0, 4.0]]"""
 
 @functools.cache
 def posed() -> Log:
-    """Three arms that agree on a pose, none of which hears another from 2.04 to 4.04 s."""
+    """Returns three arms that agree on a pose; no site hears another from 2.04 to 4.04 s."""
     text = posed_arms(5.0).replace("[link]", GLIDES)
     far = "posture_rad = [1.2, -0.3, -0.9, -1.6, -0.3, 1.4, 0.25] }"
     text = text.replace(
@@ -167,10 +168,11 @@ def posed() -> Log:
 
 
 @pytest.mark.long
-def test_arms_that_hold_pose_hold_their_joints_and_follow_again() -> None:
-    """The elbow of the slave is on its way to a posture on the other side as the links are cut.
+def test_arms_hold_joints_and_follow_again() -> None:
+    """The elbow of the slave is on its way to a posture on the other side when the links are
+    cut.
 
-    What is left is gravity that is not learnt yet.
+    The remaining motion comes from gravity that is not learnt yet.
     """
     log = posed()
     for site in log.sites:
@@ -187,8 +189,10 @@ def test_arms_that_hold_pose_hold_their_joints_and_follow_again() -> None:
 
 
 @pytest.mark.long
-def test_a_held_arm_returns_when_pushed_in_its_free_motion() -> None:
-    """By the motion in which its end effector stays; it goes back by 3/s, less what its law damps."""
+def test_held_arms_return_from_free_motion() -> None:
+    """In the motion in which its end effector stays, the arm returns at 3/s, less the damping
+    of its law.
+    """
     text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
     text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
     text = text.replace("Gamma = 1.0\n", "").replace(
@@ -209,8 +213,8 @@ def test_a_held_arm_returns_when_pushed_in_its_free_motion() -> None:
 
 
 @pytest.mark.long
-def test_references_of_poses_in_session_are_integrals_of_their_velocities() -> None:
-    """Where the reference is that of peers alone it is so only once these agree, see `task_space`."""
+def test_references_integrate_their_velocities() -> None:
+    """If the reference follows peers alone, it does so only once these agree; see `task_space`."""
     log = posed()
     for site in log.sites:
         part = log[site]
@@ -225,8 +229,10 @@ def test_references_of_poses_in_session_are_integrals_of_their_velocities() -> N
 
 
 @pytest.mark.long
-def test_energies_close_over_a_hold_in_task_space() -> None:
-    """Seven joints, four of them to spare, on their way to a posture 0.4 rad off: r has their pose in it."""
+def test_energies_close_over_a_task_space_hold() -> None:
+    """Seven joints, four of them redundant, on their way to a posture 0.4 rad off: r contains
+    their pose.
+    """
     rule = {"action": "glide", "align_speed_rad_s": 1.0, "align_limit_rad": 2.0}
     log = trilat_net.simulate(
         "unlike_arms",
@@ -240,15 +246,15 @@ def test_energies_close_over_a_hold_in_task_space() -> None:
     energies = compute_site_energies(log)
     balance = compute_energy_balance(energies)
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
-    one, modes = energies["s"], log["s"].mode
+    energy, modes = energies["s"], log["s"].mode
     first = int(np.flatnonzero(modes == "hold")[0])
     assert set(modes[first : first + 1400]) == {"hold"}
-    assert measure_torque_error(one.motion).max() <= 1e-9
+    assert measure_torque_error(energy.motion).max() <= 1e-9
     assert verify(log).differing == 0
 
 
 @pytest.mark.long
-def test_arms_of_one_pose_stop_and_return_without_a_step() -> None:
+def test_equal_arms_stop_and_return_smoothly() -> None:
     text = posed_arms(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
     scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
     orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}

@@ -1,4 +1,4 @@
-"""How arms come to rest: of all that waits, holds, is stopped or in fault, by the equations of `resting`."""
+"""Arms come to rest by the equations of `resting` in all modes that wait, hold, stop or fail."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -39,8 +39,11 @@ AT_REST_RAD_S, REST_WITHIN_S = 0.05, 1.5
 
 
 @pytest.mark.parametrize("law", ["adaptive", "pd_d"])
-def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
-    """Eq. (1) of docs/theory/coming-to-rest.md; never faster than the joint, and in its direction."""
+def test_references_rest_from_their_own_motion(law: str) -> None:
+    """Eq.
+
+    (1) of docs/theory/coming-to-rest.md; never faster than the joint, and in its direction.
+    """
     log = stopped_log(adaptive_text() if law == "adaptive" else TEXT)
     part, gains = log["s"], log.scenario.setup("s").rest
     assert set(part.mode[2000:3500]) == {"stopped"}
@@ -53,8 +56,11 @@ def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
     assert np.diff(np.abs(part.qd_des[2000:3500]), axis=0).max() <= 0.0
 
 
-def test_torque_of_stop_is_law_and_what_rests() -> None:
-    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s: Eq. (2) to (4) of docs/theory/coming-to-rest.md."""
+def test_stopping_torque_is_law_plus_rest() -> None:
+    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s: Eq.
+
+    (2) to (4) of docs/theory/coming-to-rest.md.
+    """
     log = stopped_log(TEXT)
     part, rows = log["s"], slice(2000, 3500)
     q, qd = part.q[rows], part.qd[rows]
@@ -71,10 +77,11 @@ def test_torque_of_stop_is_law_and_what_rests() -> None:
 
 
 @pytest.mark.parametrize("how", ["stop", "cut"])
-def test_storage_falls_by_what_is_dissipated(how: str) -> None:
+def test_storage_falls_by_its_dissipation(how: str) -> None:
     """V = S + 1/2 w'(k B)^-1 w, V' = -r'(Kp + B) r - qd'Kd qd at a reference at rest, learning.
 
-    S is that of the adaptive law. w goes on by Euler's rule, whose own storage is less by 1/2 h w's.
+    S is that of the adaptive law. w advances by Euler's rule, whose own storage is less by 1/2
+    h w's.
     """
     keys: dict[str, Any] = (
         {"duration_s": 6.0, "outages_s": "[[1.0, 20.0]]"} if how == "cut" else {}
@@ -117,7 +124,7 @@ class Broken:
             now.tau[i] = now.gravity[i] - 12.0 * now.qd[i] if now.k < self.at else np.nan
 
 
-def test_an_arm_whose_law_failed_is_held_where_it_is() -> None:
+def test_arms_with_failed_laws_are_held() -> None:
     text = TEXT.replace(
         'law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:Broken"'
     )
@@ -138,7 +145,7 @@ def test_an_arm_whose_law_failed_is_held_where_it_is() -> None:
     wanted=st.floats(-80.0, 80.0),
     speed=st.floats(-10.0, 10.0),
 )
-def test_a_limit_of_rate_never_holds_back_what_brakes(
+def test_rate_limits_never_hold_back_braking(
     rate: float, before: float, wanted: float, speed: float
 ) -> None:
     """Against its motion a torque reaches B |qd| farther; along it, and in RUN, as far as the rate."""
@@ -154,19 +161,21 @@ def test_a_limit_of_rate_never_holds_back_what_brakes(
         assert s.tau[0] == pytest.approx(np.clip(wanted, low, high), abs=1e-12)
 
 
-def test_credible_estimates_are_those_that_the_motors_can_hold() -> None:
+def test_motors_can_hold_every_credible_estimate() -> None:
     """T = 200 N m, g = 9.81 m/s^2, links of 1 m: first moments to T/g, second ones to l T/g."""
     gains = load_scenario("free", {"on_stale.action": "glide"}).setup("m1").gains
     moment = 200.0 / 9.81
     assert gains.low == (0.0,) * 5
     assert gains.high == pytest.approx((2.0 * moment, moment, moment, moment, moment))
-    own = {
+    own_estimate = {
         "control.law": "adaptive_box",
         "control.theta_low": [-1.0] * 5,
         "control.theta_high": [9.0] * 5,
     }
     assert (
-        load_scenario("free", {"on_stale.action": "glide", **own}).setup("m1").gains.high
+        load_scenario("free", {"on_stale.action": "glide", **own_estimate})
+        .setup("m1")
+        .gains.high
         == (9.0,) * 5
     )
     assert np.isinf(load_scenario("free").setup("m1").gains.high).all()
@@ -181,7 +190,7 @@ HARNESS = {
 
 
 @pytest.mark.parametrize("at", [530, 1200])
-def test_one_stop_of_an_arm_that_still_learns_stops_it(at: int) -> None:
+def test_one_stop_stops_a_learning_arm(at: int) -> None:
     """Damping and a frozen estimate took it from 0.61 rad/s to 5.12, over 1.92 rad."""
     log = ordered(load_scenario("free", HARNESS), {"m1": {at: "stop"}})
     part = log["m1"]
@@ -193,7 +202,9 @@ def test_one_stop_of_an_arm_that_still_learns_stops_it(at: int) -> None:
 
 
 class Stop(NamedTuple):
-    """One stop of one site: speed at the order, the largest after it, when it rested, and the way."""
+    """One stop of one site: speed at the order, the largest speed afterwards, time of rest, and
+    distance.
+    """
 
     at: int
     site: str
@@ -204,7 +215,9 @@ class Stop(NamedTuple):
 
 
 def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
-    """Stops one site in turn at instants of a run, each from the two records before; nobody else matters."""
+    """Stops one site in turn at instants of a run, each from the two records before; no other
+    site matters.
+    """
     names = log.scenario.names
     for n, at in enumerate(np.linspace(5, len(log[names[0]]) - 5, count).astype(int).tolist()):
         part = log[names[n % len(names)]]
@@ -213,16 +226,16 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
             *(read_output(part.states[row], part.peers) for row in (at - 2, at - 1))
         )
         order = [CoreChange("stop", order=LifeOrder.STOP)]
-        made = [
+        stops = [
             site.step(TickInput(k, commands=order if k == at else ()))
             for k in range(at, at + ticks)
         ]
         qd, q = (
-            np.array([record.qd for record in made]),
-            np.array([record.q for record in made]),
+            np.array([record.qd for record in stops]),
+            np.array([record.q for record in stops]),
         )
         speed = np.abs(qd).max(axis=1)
-        pushed = np.array([record.tau_x for record in made])
+        pushed = np.array([record.tau_x for record in stops])
         given = yielding(log.scenario.setup(part.name).rest, pushed, part.rate_hz)
         moving = np.flatnonzero((np.abs(qd) > AT_REST_RAD_S + np.abs(given)).any(axis=1))
         rest_s = float(moving[-1] + 1) / part.rate_hz if len(moving) else 0.0
@@ -230,9 +243,11 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
 
 
 def yielding(gains: RestGains, tau_x: Array, rate_hz: int) -> Array:
-    """The speed at which joints yield to a hand whose torque changes, rad/s, rows of ticks.
+    """Returns the speed at which joints yield to a hand whose torque changes, rad/s, rows of
+    ticks.
 
-    M s' = w + tau_x - B s, w' = -k B s, M = B T, k = 1 / 4T: to a step of tau_x it is t exp(-t / 2T) / M.
+    M s' = w + tau_x - B s, w' = -k B s, M = B T, k = 1 / 4T: to a step of tau_x it is t exp(-t
+    / 2T) / M.
     """
     t = np.arange(len(tau_x))[:, None] / rate_hz
     answer = t * np.exp(-t / (2.0 * gains.time_s)) / (np.array(gains.damping) * gains.time_s)
@@ -243,7 +258,7 @@ def yielding(gains: RestGains, tau_x: Array, rate_hz: int) -> Array:
 
 
 def largest_fall(scenario: Scenario, site: str) -> tuple[float, float]:
-    """The largest |M^-1 G| of an arm over two hundred poses, rad/s^2, and the largest |G|, N m."""
+    """Returns the largest |M^-1 G| of an arm over two hundred poses, rad/s^2, and the largest |G|, N m."""
     arm, rows = scenario.arms[site], build_arm_rows(scenario, site)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, arm.counts.joints))
     still = np.zeros_like(q)
@@ -258,10 +273,11 @@ def largest_fall(scenario: Scenario, site: str) -> tuple[float, float]:
 
 
 def gravity_gives(scenario: Scenario, site: str) -> tuple[float, float]:
-    """The speed that gravity may give an arm until w has taken it on, rad/s, and that in its start.
+    """Returns the speed that gravity may give an arm until w balances gravity, rad/s, and the
+    speed in its start.
 
-    That of a free fall for the time in which B brakes; in the first 0.1 s of a start also for the time that
-    the limit of rate takes from no torque to G.
+    The first is that of a free fall for the time in which B brakes. The first 0.1 s of a start
+    add the time that the limit of rate takes from no torque to G.
     """
     fall, most = largest_fall(scenario, site)
     setup = scenario.setup(site)
@@ -270,9 +286,10 @@ def gravity_gives(scenario: Scenario, site: str) -> tuple[float, float]:
 
 
 def assert_stops(log: Log, count: int) -> None:
-    """The bar of a stop; what gravity does not pull has what its torque at the order gives while B brakes.
+    """Asserts the bound of a stop: beyond gravity, an arm has only the speed that its torque at
+    the order gives while B brakes.
 
-    An arm that a hand pushes ever harder yields to that, and to nothing else.
+    An arm that a hand pushes ever harder yields to that push, and to nothing else.
     """
     gives = {site: gravity_gives(log.scenario, site) for site in log.scenario.names}
     for stop in stop_at_instants(log, count):
@@ -290,7 +307,7 @@ def run_of(name: str, law: str, settings: dict[str, Any], duration_s: float = 6.
     return trilat_net.simulate(load_scenario(name, keys))
 
 
-def test_a_stop_at_ten_instants_ends_in_rest() -> None:
+def test_ten_stops_end_in_rest() -> None:
     assert_stops(run_of("free", "adaptive", {}, 2.0), 10)
 
 
@@ -313,14 +330,12 @@ def test_every_law_is_stopped_in_some_run() -> None:
 @pytest.mark.parametrize(
     ("name", "law", "settings"), RUNS, ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_a_stop_at_two_hundred_instants_ends_in_rest(
-    name: str, law: str, settings: dict[str, Any]
-) -> None:
+def test_two_hundred_stops_end_in_rest(name: str, law: str, settings: dict[str, Any]) -> None:
     assert_stops(run_of(name, law, settings), 200)
 
 
 @pytest.mark.parametrize("space", ["joints", "position"])
-def test_a_force_on_a_peer_moves_no_arm_at_rest(space: str) -> None:
+def test_forces_on_a_peer_move_no_resting_arm(space: str) -> None:
     """The law of the stopped arm reflects forces, but only while the arm follows its peer."""
     axes = {} if space == "joints" else {"axes": ["x", "y"]}
     push = {"kind": "pulse", "start_s": 3.0, "end_s": 5.0, "peak_nm": [6.0, 3.0]}

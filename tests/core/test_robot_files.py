@@ -148,19 +148,21 @@ ROBOTS = Path(__file__).parents[1] / "scenario/robots"
 
 
 def parse_chains() -> list[tuple[str, str, str, int]]:
-    found, file = [], ""
+    chains, file = [], ""
     for word in CHAINS.split():
         if word.endswith(".urdf"):
             file = word
         else:
             ends, _, n = word.rpartition(":")
             base, _, tip = ends.rpartition(">")
-            found.append((file, base, tip, int(n)))
-    return found
+            chains.append((file, base, tip, int(n)))
+    return chains
 
 
 def read_robot(file: str) -> str:
-    """The text of a file; a joint with the name of a link is renamed, as Pinocchio has one list of frames."""
+    """Returns the text of a file; a joint with the name of a link is renamed, as Pinocchio has
+    one list of frames.
+    """
     root = ElementTree.parse(robot_files()[file]).getroot()
     links = {link.get("name") for link in root.findall("link")}
     for joint in root.findall("joint"):
@@ -174,7 +176,7 @@ def read_robot(file: str) -> str:
 
 
 def parsed_model(text: str, chain: UrdfChain) -> pin.Model:
-    """Pinocchio's model of the file, all joints but the chain's held at zero."""
+    """Returns Pinocchio's model of the file, all joints but the chain's held at zero."""
     whole = pin.buildModelFromXML(text)
     kept = {joint.name for joint in chain.joints}
     held = [whole.getJointId(name) for name in whole.names[1:] if name not in kept]
@@ -189,27 +191,27 @@ def test_every_file_is_in_the_list() -> None:
 @pytest.mark.parametrize(
     ("file", "tip", "reason"), [(file, *why) for file, why in REFUSED.items()]
 )
-def test_a_file_without_a_chain_is_refused_with_the_reason(
-    file: str, tip: str, reason: str
-) -> None:
+def test_files_without_chain_are_refused(file: str, tip: str, reason: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         read_urdf(robot_files()[file].read_text(), tip=tip)
     assert reason in str(caught.value)
 
 
 @pytest.mark.parametrize(("file", "base", "tip", "n"), parse_chains())
-def test_a_chain_is_what_pinocchio_reads(file: str, base: str, tip: str, n: int) -> None:
-    """Bodies, frames, limits; M, torque, pose and Jacobian of the model rebuilt from it; then the core's."""
+def test_chains_equal_pinocchios(file: str, base: str, tip: str, n: int) -> None:
+    """Bodies, frames, limits; M, torque, pose and Jacobian of the model rebuilt from the chain;
+    then the core's.
+    """
     text = read_robot(file)
     chain = read_urdf(text, base, tip)
     assert len(chain.joints) == n
     check_dynamics(text, chain)
 
 
-def mend(text: str, link: str, given: LinkInertia) -> str:
+def mend(text: str, link: str, link_inertia: LinkInertia) -> str:
     """Returns a file with a mass and an inertia of a link written into its XML."""
     root = ElementTree.fromstring(text)
-    element = next(one for one in root.findall("link") if one.get("name") == link)
+    element = next(match for match in root.findall("link") if match.get("name") == link)
     inertial = element.find("inertial")
     if inertial is None:
         inertial = ElementTree.SubElement(element, "inertial")
@@ -217,14 +219,14 @@ def mend(text: str, link: str, given: LinkInertia) -> str:
     for tag in ("origin", "mass", "inertia"):
         part = inertial.find(tag)
         parts[tag] = ElementTree.SubElement(inertial, tag) if part is None else part
-    if given.mass_kg is not None:
-        parts["mass"].set("value", repr(given.mass_kg))
-    if given.com_m is not None:
-        parts["origin"].set("xyz", " ".join(map(repr, given.com_m)))
-    if given.inertia_kg_m2 is not None:
+    if link_inertia.mass_kg is not None:
+        parts["mass"].set("value", repr(link_inertia.mass_kg))
+    if link_inertia.com_m is not None:
+        parts["origin"].set("xyz", " ".join(map(repr, link_inertia.com_m)))
+    if link_inertia.inertia_kg_m2 is not None:
         parts["origin"].set("rpy", "0 0 0")
         keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-        for key, value in zip(keys, given.inertia_kg_m2, strict=True):
+        for key, value in zip(keys, link_inertia.inertia_kg_m2, strict=True):
             parts["inertia"].set(key, repr(value))
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -251,7 +253,7 @@ GIVEN = [
 
 
 @pytest.mark.parametrize(("file", "tip", "links"), GIVEN)
-def test_given_inertias_are_those_of_the_same_file_mended(
+def test_given_inertias_equal_the_mended_file(
     file: str | Path, tip: str, links: dict[str, LinkInertia]
 ) -> None:
     text = file.read_text() if isinstance(file, Path) else read_robot(file)
@@ -261,7 +263,7 @@ def test_given_inertias_are_those_of_the_same_file_mended(
     check_dynamics(mended, read_urdf(text, tip=tip, links=links))
 
 
-def test_a_balanced_finger_is_that_of_the_same_file_mended() -> None:
+def test_balanced_fingers_equal_the_mended_file() -> None:
     text = (ROBOTS / "finger_inertia.urdf").read_text()
     nearest = LinkInertia(inertia_kg_m2=(1.35e-6, 0.0, 2.65e-6, 0.0, 0.0, 4e-6))
     check_dynamics(mend(text, "finger", nearest), read_urdf(text, balance=True))
@@ -269,7 +271,7 @@ def test_a_balanced_finger_is_that_of_the_same_file_mended() -> None:
 
 
 def check_dynamics(text: str, chain: UrdfChain) -> None:
-    """A chain against Pinocchio: bodies, frames, limits, and the terms of the dynamics."""
+    """Compares a chain with Pinocchio: bodies, frames, limits, and the terms of the dynamics."""
     model = parsed_model(text, chain)
     n = len(chain.joints)
     assert [joint.name for joint in chain.joints] == list(model.names)[1:]
@@ -328,7 +330,7 @@ def check_joints(chain: UrdfChain, model: pin.Model) -> None:
 
 
 def check_core(chain: UrdfChain, state: ChainState) -> None:
-    """The leaves of the core against what Pinocchio said."""
+    """Compares the leaves of the core with Pinocchio's results."""
     n = len(chain.joints)
     joints = [
         ChainJoint(j.kind == "prismatic", j.axis, j.rotation, j.origin_m) for j in chain.joints
@@ -370,13 +372,13 @@ def test_the_core_agrees_on_random_chains(seed: int, sliders: list[bool]) -> Non
 
 
 def near(a: object, b: object, tolerance: float) -> bool:
-    """Relative to the largest entry."""
+    """Asserts equality relative to the largest entry."""
     a, b = np.asarray(a), np.asarray(b)
     return bool(np.abs(a - b).max() <= tolerance * max(np.abs(b).max(), 1e-3))
 
 
-def test_pinocchio_says_of_the_stored_references_what_is_stored() -> None:
-    """The file of references is that of its script."""
+def test_stored_references_are_pinocchios() -> None:
+    """The file of references is the output of its script."""
     for chain, states in chain_references().values():
         model = build_model(chain)
         for state in states:
@@ -384,25 +386,25 @@ def test_pinocchio_says_of_the_stored_references_what_is_stored() -> None:
                 assert near(value, getattr(state, key), 1e-12), key
 
 
-def test_the_torque_of_two_velocities_is_the_christoffel_one() -> None:
+def test_two_velocity_torque_uses_christoffel_symbols() -> None:
     """Linear in v, equal to Pinocchio's where v is qd, and dM/dt = C + C'."""
     for chain, (state, *_) in chain_references().values():
         model, n = build_model(chain), len(chain.joints)
-        asked = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
+        resting = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
 
         def C(
             v: Array,
             model: pin.Model = model,
             chain: UrdfChain = chain,
-            asked: dict[str, Array] = asked,
+            still: dict[str, Array] = resting,
         ) -> Array:
-            return answer(model, chain, asked | {"v": v})["inverse_dynamics"]
+            return answer(model, chain, still | {"v": v})["inverse_dynamics"]
 
         matrix = np.stack([C(axis) for axis in np.eye(n)], axis=1)
         assert near(matrix @ state.v, C(state.v), 1e-12)
         h = 1e-6
         ends = [
-            answer(model, chain, asked | {"q": state.q + s * h * state.qd})["inertia"]
+            answer(model, chain, resting | {"q": state.q + s * h * state.qd})["inertia"]
             for s in (1, -1)
         ]
         assert near(matrix + matrix.T, (ends[0] - ends[1]) / (2 * h), 1e-7)

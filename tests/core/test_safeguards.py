@@ -1,4 +1,4 @@
-"""Limits, faults, stops: what no law, peer or order can make an arm do."""
+"""Limits, faults and stops bound every arm, whatever law, peer or order."""
 
 import re
 
@@ -35,7 +35,7 @@ from trilat_net.scenario.run_changes import make_site_order
 
 
 @pytest.mark.long
-def test_a_log_with_orders_is_executed_again_in_every_way() -> None:
+def test_logs_with_orders_verify_in_every_way() -> None:
     log = stopped_log()
     assert verify(log).identical == 12_000
     assert compare_with_virtual(log).fed.identical == 12_000
@@ -43,7 +43,7 @@ def test_a_log_with_orders_is_executed_again_in_every_way() -> None:
     assert again.sites["s"].identical == 6000
 
 
-def test_a_site_that_is_stopped_goes_on_learning() -> None:
+def test_stopped_sites_go_on_learning() -> None:
     log = stopped_log(adaptive_text(), 3000)
     theta_hat = log["s"].theta_hat
     assert np.ptp(theta_hat[2000:3000], axis=0).max() > 1e-3
@@ -59,13 +59,13 @@ def test_a_site_that_is_stopped_goes_on_learning() -> None:
         ({"qd_limit_rad_s": 0.4}, LifeReason.LIMIT_QD),
     ],
 )
-def test_a_passed_limit_is_a_fault_until_it_is_reset(
+def test_a_passed_limit_is_a_lasting_fault(
     limits: dict[str, object], reason: LifeReason
 ) -> None:
     scenario = guarded(limits, where="sites.s.")
     log = ordered(scenario, {"m": {4500: "enable"}, "s": {4500: "stop", 5000: "reset"}})
-    found = reasons(log, "s")
-    assert ("fault", reason) in found
+    modes = reasons(log, "s")
+    assert ("fault", reason) in modes
     at = list(log["s"].mode).index("fault")
     assert set(log["s"].mode[at:5000]) == {"fault"}  # no other order ends it
     assert "diverged" not in set(log["m"].mode)
@@ -80,7 +80,7 @@ def test_a_passed_limit_is_a_fault_until_it_is_reset(
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 12))]
 )
-def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) -> None:
+def test_torque_rates_stay_limited_in_any_event(seed: int) -> None:
     """Peers 3 rad apart, cuts, stops, a fault by a limit, returns: in the end they follow each other."""
     random = np.random.default_rng(seed)
     cuts = np.sort(random.uniform(1.0, 6.0, 4)).round(3).reshape(2, 2).tolist()
@@ -101,8 +101,8 @@ def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) ->
     assert verify(log).identical == 28_000
 
 
-def test_the_rate_limit_keeps_a_reference_jump_from_the_torque() -> None:
-    """A peer 3 rad away that is used at once: of today's rule, with and without its limits."""
+def test_rate_limits_keep_reference_jumps_out() -> None:
+    """A peer 3 rad away that is used at once, under the default rule, with and without its limits."""
     text = TEXT.replace('action = "glide"', 'action = "use"').replace(
         "q0_rad = [0.1, 0.4]", "q0_rad = [2.6, 0.4]"
     )
@@ -120,7 +120,7 @@ def test_the_rate_limit_keeps_a_reference_jump_from_the_torque() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "words"),
+    ("limits", "phrase"),
     [
         ({"q_min_rad": 1.0, "q_max_rad": 0.5}, "above q_min_rad"),
         ({"q_max_rad": 0.2}, "start at most"),
@@ -128,12 +128,12 @@ def test_the_rate_limit_keeps_a_reference_jump_from_the_torque() -> None:
         ({"tau_rate_limit_nm_s": 0.0}, "tau_rate_limit_nm_s"),
     ],
 )
-def test_limits_that_cannot_be_are_refused(limits: dict[str, object], words: str) -> None:
-    with pytest.raises(ScenarioError, match=words):
+def test_impossible_limits_are_refused(limits: dict[str, object], phrase: str) -> None:
+    with pytest.raises(ScenarioError, match=phrase):
         guarded(limits)
 
 
-def test_limits_of_position_need_the_rule_that_keeps_them() -> None:
+def test_position_limits_need_a_rule() -> None:
     with pytest.raises(
         ScenarioError, match=r"limits.q_max_rad: applies only with on_stale.action = 'glide'"
     ):
@@ -150,8 +150,11 @@ def test_limits_of_position_need_the_rule_that_keeps_them() -> None:
         (201, "fault"),
     ],
 )
-def test_missed_ticks_are_held_or_a_fault_never_repeated(missed: int, mode: str) -> None:
-    """A simulated arm stands still meanwhile. The log is whole, and is executed again without them."""
+def test_missed_ticks_are_held_or_a_fault(missed: int, mode: str) -> None:
+    """A simulated arm stands still meanwhile.
+
+    The log is whole, and is executed again without the missed ticks.
+    """
     scenario = guarded(text=adaptive_text(), duration_s=4.0)
     at = 2000 + missed
     log = ordered(scenario, {"s": {at: "overrun"}}, ticks=missed)
@@ -175,13 +178,13 @@ def test_missed_ticks_are_held_or_a_fault_never_repeated(missed: int, mode: str)
         assert part.mode[-1] == "run"
 
 
-def test_a_site_of_another_rule_knows_no_orders() -> None:
+def test_sites_of_other_rules_know_no_orders() -> None:
     with pytest.raises(ScenarioError, match=r"has on_stale\.action = 'use'"):
         make_site_order(load_scenario("free"), "s", "stop", 0)
 
 
 @pytest.mark.long
-def test_stops_and_returns_step_no_more_than_run_without_them() -> None:
+def test_stops_and_returns_add_no_steps() -> None:
     """Arms that begin 3 rad apart, without a limit of the torque's rate."""
     text = adaptive_text().replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]")
     text = text.replace("q0_rad = [0.1, 0.4]", "q0_rad = [-0.1, 1.9]")
@@ -201,7 +204,7 @@ def test_stops_and_returns_step_no_more_than_run_without_them() -> None:
 
 
 class Pull:
-    """Springs to the peers themselves: what they sent last pulls on, however long ago that was."""
+    """A law of springs to the peers themselves, which pulls towards their last samples, however old."""
 
     remembers = ()
 
@@ -226,7 +229,7 @@ def with_own_law(name: str) -> Log:
     return trilat_net.simulate(guarded({}, text, outages_s="[[2.0, 2.6]]", duration_s=4.0))
 
 
-def test_a_users_law_yields_to_gravity_while_its_site_holds() -> None:
+def test_own_laws_yield_to_gravity_while_holding() -> None:
     """The slave holds from 2.12 to 2.7 s."""
     log = with_own_law("Pull")
     part = log["s"]
@@ -245,7 +248,7 @@ def test_a_users_law_yields_to_gravity_while_its_site_holds() -> None:
     assert compare_with_virtual(log).fed.identical == 8000
 
 
-def test_a_law_that_says_that_it_holds_is_asked_on() -> None:
+def test_a_holding_law_is_still_called() -> None:
     log = with_own_law("PullHeld")
     part, q = log["s"], log["s"].q[2120:2700]
     gravity = gravity_of(log.scenario.arms["s"].theta, q)

@@ -1,4 +1,6 @@
-"""The rule `glide`: what a site does before its peers are there, while one is silent, and on its way back."""
+"""The rule `glide`: a site before its peers have joined, during the silence of a peer, and on
+its way back.
+"""
 
 import numpy as np
 import pytest
@@ -30,7 +32,7 @@ def log() -> Log:
     return trilat_net.simulate(glide())
 
 
-def test_it_waits_at_its_own_pose_then_aligns_then_follows(log: Log) -> None:
+def test_sites_wait_then_align_then_follow(log: Log) -> None:
     for site, other in (("m", "s"), ("s", "m")):
         part = log[site]
         modes = part.mode
@@ -47,8 +49,8 @@ def test_it_waits_at_its_own_pose_then_aligns_then_follows(log: Log) -> None:
         assert np.abs(part.q_des[engaged:2000] - late).max() == 0.0
 
 
-def test_a_silent_peer_is_held_after_twenty_milliseconds(log: Log) -> None:
-    """Samples of the outage would come into use from 2.1 s on; the last one did at 2.099 s."""
+def test_a_silent_peer_is_held_after_20_ms(log: Log) -> None:
+    """Samples of the outage would come into use from 2.1 s on; the last sample did at 2.099 s."""
     modes = log["s"].mode
     assert modes[2119] == "run"
     assert modes[2120] == "hold"
@@ -60,10 +62,10 @@ def test_a_silent_peer_is_held_after_twenty_milliseconds(log: Log) -> None:
 
 
 @pytest.mark.parametrize("site", ["m", "s"])
-def test_the_reference_never_jumps_and_has_its_derivative(site: str, log: Log) -> None:
-    """In all modes: a step of q_des is the integral of qd_des, to the third order of the tick.
+def test_the_reference_never_jumps(site: str, log: Log) -> None:
+    """In all modes a step of q_des is the integral of qd_des, to the third order of the tick.
 
-    Where it begins to rest it leaves the peers' for its own pose.
+    Where the arm begins to rest, the reference changes from the peers' to its own pose.
     """
     part, h_s = log[site], 1e-3
     steps = np.diff(part.q_des, axis=0)
@@ -77,7 +79,7 @@ def test_the_reference_never_jumps_and_has_its_derivative(site: str, log: Log) -
 
 
 @pytest.mark.parametrize("speed", [0.2, 1.0])
-def test_way_to_peers_is_no_faster_than_it_may_be(speed: float) -> None:
+def test_approaches_to_peers_keep_their_speed_limit(speed: float) -> None:
     log = trilat_net.simulate(glide(12.0, outages_s="[]", speed=speed))
     part, other = log["s"], log["m"]
     aligning = np.flatnonzero(part.mode == "return")
@@ -87,7 +89,7 @@ def test_way_to_peers_is_no_faster_than_it_may_be(speed: float) -> None:
     assert np.abs(way_rate[-1]).max() <= 0.02
 
 
-def test_farther_than_its_limit_it_waits_and_says_so() -> None:
+def test_sites_beyond_their_limit_wait_and_say_so() -> None:
     log = trilat_net.simulate(glide(1.0, outages_s="[]", limit=0.1))
     assert set(log["s"].mode) == {"waiting"}
     shared = 2
@@ -108,14 +110,14 @@ def test_every_driver_gives_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "silence", "words"),
+    ("rate_hz", "silence", "phrase"),
     [(100, 5.0, "two periods of 100 Hz"), (1000, 1.0, "two periods")],
 )
 def test_a_silence_shorter_than_two_periods_is_refused(
-    rate_hz: int, silence: float, words: str
+    rate_hz: int, silence: float, phrase: str
 ) -> None:
     text = TEXT.replace('action = "glide"', f'action = "glide"\nsilence_ms = {silence}')
-    with pytest.raises(ScenarioError, match=words):
+    with pytest.raises(ScenarioError, match=phrase):
         parse_scenario(
             text.format(duration_s=1.0, rate_hz=rate_hz, outages_s="[]", speed=0.5, limit=1.0)
         )

@@ -1,4 +1,4 @@
-"""The tables of a run are no larger than its delays need, and never smaller."""
+"""The tables of a run are exactly as large as its delays need."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from trilat_net.scenario import load_scenario
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_no_sample_is_due_later_than_the_longest_delay(name: str) -> None:
+def test_no_sample_is_due_after_the_longest_delay(name: str) -> None:
     model = KINDS[name]
     traces = [POINTS if name == "trace" else None]
     due_ns = due(channel([model], 3, points=POINTS), 5000)
@@ -24,8 +24,8 @@ def test_no_sample_is_due_later_than_the_longest_delay(name: str) -> None:
     assert delay_us.max() <= longest <= MAX_DELAY_US
 
 
-def test_links_have_pages_for_their_delays_and_not_many_more() -> None:
-    """Of a distribution without a bound for the largest number that a draw may come to."""
+def test_links_have_about_the_pages_they_need() -> None:
+    """For a distribution without bound, the largest possible draw counts."""
 
     def pages(**changes: object) -> int:
         setups = [setup(name, "free", **changes) for name in ("m1", "m2", "s")]
@@ -38,14 +38,14 @@ def test_links_have_pages_for_their_delays_and_not_many_more() -> None:
     assert 10_000 < heavy <= calendar_pages(1000)
 
 
-def test_stacked_tables_hold_each_site_s_own() -> None:
+def test_stacked_tables_hold_each_sites_own() -> None:
     scenario = load_scenario("windup")
     setups = [scenario.setup(name) for name in scenario.names]
     whole = stack_site_arrays(setups)
-    for n, one in enumerate(setups):
-        own = build_site_arrays(one)
-        assert whole.site[n].tobytes() == own.site.tobytes()
-        assert whole.links[n].tobytes() == own.links.tobytes()
-        assert whole.ramps[n].tobytes() == own.ramps.tobytes()
+    for n, setup_of_lane in enumerate(setups):
+        site_arrays = build_site_arrays(setup_of_lane)
+        assert whole.site[n].tobytes() == site_arrays.site.tobytes()
+        assert whole.links[n].tobytes() == site_arrays.links.tobytes()
+        assert whole.ramps[n].tobytes() == site_arrays.ramps.tobytes()
         mine = whole.actors[n][whole.actors[n]["sampled"] != 2]
-        assert mine.tobytes() == own.actors.tobytes()
+        assert mine.tobytes() == site_arrays.actors.tobytes()

@@ -1,4 +1,4 @@
-"""The step: pure, resumable, bounded, and finite whatever comes (L1, L3)."""
+"""The step is pure, resumable, bounded, and finite for any input (L1, L3)."""
 
 import math
 import struct
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from tests.core.sites import VECTORS, bits, sample, setup, stepped
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
@@ -38,16 +38,18 @@ arrivals = st.lists(
     came=st.lists(arrivals, min_size=1, max_size=40),
     scheme=st.sampled_from(["second_order", "digital"]),
 )
-def test_two_fresh_sites_fed_same_ticks_give_same_bits(
-    came: list[list[Arrival]], scheme: str
-) -> None:
+def test_equal_ticks_give_equal_bits(came: list[list[Arrival]], scheme: str) -> None:
     ticks = [TickInput(k, c) for k, c in enumerate(came)]
     one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
     assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
 
 
-def test_record_holds_state_at_its_tick_and_its_inputs() -> None:
-    """Stage 7 emits before stage 8 advances; tau_x is the negative of the torque ON the arm, Eq. (8)."""
+def test_records_hold_their_ticks_state_and_inputs() -> None:
+    """Stage 7 emits before stage 8 advances; tau_x is the negative of the torque ON the arm,
+    Eq.
+
+    (8).
+    """
     site = Site(
         setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4])
     )
@@ -68,16 +70,16 @@ for scheme in ("second_order", "digital"):
 
 
 @pytest.mark.push
-def test_without_the_compiler_a_run_has_the_same_bits() -> None:
-    plain = printed(_PROGRAM, compiled=False)
+def test_uncompiled_runs_have_the_same_bits() -> None:
+    plain = run_program(_PROGRAM, compiled=False)
     assert plain.count("\n") == 2 * 3 * 250
-    assert plain == printed(_PROGRAM, compiled=True)
+    assert plain == run_program(_PROGRAM, compiled=True)
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("k", [1, 2, 21, 150])
-def test_site_resumed_from_two_records_goes_on_with_same_bits(scheme: str, k: int) -> None:
-    """Every record is a key-frame: records k-2 and k-1 and what waits in the links."""
+def test_two_records_resume_the_same_bits(scheme: str, k: int) -> None:
+    """Every record is a key-frame: records k-2 and k-1 and the waiting samples of the links."""
     built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
     ticks = [
         TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)
@@ -93,8 +95,10 @@ def test_site_resumed_from_two_records_goes_on_with_same_bits(scheme: str, k: in
 
 
 @pytest.mark.parametrize("name", ["asymmetric", "paper", "two_sites"])
-def test_rates_of_their_own_meet_on_the_grid(name: str) -> None:
-    """Any mix of rates runs; every site ages what it uses by the delay and less than two periods."""
+def test_different_rates_meet_on_the_grid(name: str) -> None:
+    """Any mix of rates runs; every site's samples in use are older than the delay by less than
+    two periods.
+    """
     scenario = load_scenario(name)
     rates = dict(zip(scenario.names, (1000, 450, 333), strict=False))
     changed = load_scenario(
@@ -120,7 +124,7 @@ def four_sites() -> dict[str, object]:
     }
 
 
-def test_nothing_knows_the_number_three() -> None:
+def test_no_code_depends_on_three_sites() -> None:
     last = {
         site.name: o
         for site, _, o in virtual.execute_virtual(
@@ -134,14 +138,14 @@ def test_nothing_knows_the_number_three() -> None:
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
-def test_the_torque_limit_cuts(scheme: str) -> None:
+def test_the_torque_limit_is_applied(scheme: str) -> None:
     site = Site(setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
     torques = [o.tau for o in stepped(site, [TickInput(k) for k in range(400)])]
     assert max(abs(t) for tau in torques for t in tau) == 2.0
     assert site.step(TickInput(400)).mode is Mode.RUN
 
 
-def test_a_site_beyond_its_speed_limit_diverges_once_and_stays() -> None:
+def test_sites_beyond_their_speed_limit_diverge_once() -> None:
     site = Site(setup("m1", "free", limits__qd_limit_rad_s=0.5))
     outputs = stepped(site, [TickInput(k) for k in range(400)])
     k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
@@ -152,7 +156,7 @@ def test_a_site_beyond_its_speed_limit_diverges_once_and_stays() -> None:
     )
 
 
-def test_a_run_that_diverges_ends_at_that_instant() -> None:
+def test_a_diverged_run_ends_at_once() -> None:
     ran = list(virtual.execute_virtual(load_scenario("free", {"limits.qd_limit_rad_s": 0.5})))
     assert ran[-1].output.t_ns == ran[-3].output.t_ns < 20 * 10**9
     assert any(r.output.mode is Mode.DIVERGED for r in ran[-3:])
@@ -168,10 +172,10 @@ extreme = st.sampled_from([1.7e308, -1.7e308, 1e200, -1e160, 5e-324, 0.0, 1.0])
     Lambda=st.sampled_from([1.0, 5.0, 1e9]),
     scheme=st.sampled_from(["second_order", "digital"]),
 )
-def test_no_record_ever_holds_what_is_not_finite(
+def test_no_record_is_ever_infinite(
     came: list[tuple[float, float, float, float]], Lambda: float, scheme: str
 ) -> None:
-    """Whatever finite numbers a peer sends, and whatever gains a person chose."""
+    """For any finite numbers of a peer, and any gains."""
     site = Site(setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0))
     for k, numbers in enumerate([None, *came, None, None]):
         numbers_of_tick = (
@@ -190,9 +194,7 @@ LARGEST = 1e9
     [f"control.{gain}" for gain in ("Gamma", "Lambda", "theta_hat0", "Kp", "Kd")]
     + ["arm.g_m_s2", "sites.m1.q0_rad", "sites.m1.qd0_rad_s", "limits.tau_limit_nm"],
 )
-def test_absurd_scenarios_are_refused_or_stop_with_finite_numbers(
-    key: str, scheme: str
-) -> None:
+def test_absurd_scenarios_are_refused_or_stop_finite(key: str, scheme: str) -> None:
     with pytest.raises(ScenarioError, match=key.rpartition(".")[2]):
         load_scenario("paper", {key: 1e308})
     ran = list(
@@ -203,19 +205,21 @@ def test_absurd_scenarios_are_refused_or_stop_with_finite_numbers(
     assert all(finite(r.output) for r in ran)
 
 
-def test_more_arrivals_than_a_tick_takes_are_refused() -> None:
+def test_too_many_arrivals_in_a_tick_are_refused() -> None:
     site = Site(setup())
     site.step(TickInput(0, [sample(n) for n in range(MAX_ARRIVALS)]))
     with pytest.raises(ValueError, match="4096"):
         site.step(TickInput(1, [sample(n) for n in range(MAX_ARRIVALS + 1)]))
 
 
-def test_the_arrivals_crc_is_that_of_their_bytes() -> None:
+def test_arrival_checksums_cover_their_bytes() -> None:
     """rx_crc: little-endian (peer i64, tick i64, q f64s, qd f64s) of each arrival."""
 
-    came = [
+    arrivals_made = [
         Arrival(1, 5, (0.1, -0.0), (3.0, 4.0), 77),
         Arrival(0, 2, (1.0, 2.0), (0.5, 5e-324), 9),
     ]
-    packed = b"".join(struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in came)
-    assert Site(setup()).step(TickInput(0, came)).rx_crc == zlib.crc32(packed)
+    packed = b"".join(
+        struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in arrivals_made
+    )
+    assert Site(setup()).step(TickInput(0, arrivals_made)).rx_crc == zlib.crc32(packed)

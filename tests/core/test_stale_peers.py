@@ -1,4 +1,4 @@
-"""What a site does about a stale peer: its modes, and a reference without steps on the way back."""
+"""Modes of a site with a stale peer, and a reference without steps on the way back."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ RULE = StaleRule(StaleAction.HOLD, 20 * MS, 30 * MS)
 def site(
     rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0
 ) -> Site:
-    """Two peers behind 5 ms; what it follows it gets from `moving`."""
+    """Returns a site with two peers behind 5 ms; the samples of its peers come from `moving`."""
     links = tuple(
         LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(LinkModel(location=5_000.0),))
         for n, (name, share) in enumerate(zip("ab", shares, strict=True))
@@ -30,18 +30,18 @@ def site(
     return Site(setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s))
 
 
-def at(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Where a peer is and how fast it moves: straight on, each its own way."""
+def peer_state(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Returns position and velocity of a peer on its own straight way."""
     speed = (0.6, -0.2) if peer else (-0.3, 0.5)
     return (0.4 * peer + speed[0] * tick / 1000, -0.3 + speed[1] * tick / 1000), speed
 
 
 def moving(peer: int, tick: int) -> Arrival:
-    return Arrival(peer, tick, *at(peer, tick))
+    return Arrival(peer, tick, *peer_state(peer, tick))
 
 
 def cut_ticks(count: int = 200) -> list[TickInput]:
-    """Both peers heard every tick, but not peer 1 in samples from 50 to 90."""
+    """Yields both peers at every tick, except peer 1 in samples from 50 to 90."""
     return [
         TickInput(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and 50 <= k - 1 < 90)])
         for k in range(count)
@@ -49,12 +49,12 @@ def cut_ticks(count: int = 200) -> list[TickInput]:
 
 
 def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
-    """What a site makes of that."""
+    """Returns the records of a site during that cut."""
     return stepped(site(rule), cut_ticks(count))
 
 
 def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
-    """(mode, first tick) of every stretch."""
+    """Returns (mode, first tick) of every stretch."""
     edges = [
         0,
         *(k for k in range(1, len(outputs)) if outputs[k].mode is not outputs[k - 1].mode),
@@ -65,9 +65,10 @@ def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
 def followed(
     output: TickRecord, shares: Sequence[float] = (0.5, 0.5)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the peers ask for, from the samples in use."""
+    """Returns the reference of the peers, from the samples in use."""
     poses = [
-        ((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else at(j, m) for j, m in enumerate(output.used)
+        ((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else peer_state(j, m)
+        for j, m in enumerate(output.used)
     ]
     q, qd = (np.array([pose[n] for pose in poses]) for n in (0, 1))
     return np.array(shares) @ q, np.array(shares) @ qd
@@ -79,17 +80,17 @@ def followed(
 @pytest.mark.parametrize(
     ("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)]
 )
-def test_cut_leads_to_hold_or_brake_and_back_by_return(action: StaleAction, mode: Mode) -> None:
+def test_cuts_lead_to_hold_and_return(action: StaleAction, mode: Mode) -> None:
     """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
     outputs = cut(RULE._replace(action=action))
     assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
 
 
-def test_to_use_is_to_go_on() -> None:
+def test_the_rule_use_continues() -> None:
     assert runs_of(cut(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
 
 
-def test_a_peer_stale_again_during_the_return_is_held() -> None:
+def test_staleness_during_a_return_is_held() -> None:
     ticks = [
         TickInput(
             k,
@@ -110,23 +111,23 @@ def test_a_peer_stale_again_during_the_return_is_held() -> None:
     assert outputs[110].q_des != outputs[70].q_des
 
 
-def test_peer_that_was_never_heard_is_as_old_as_run() -> None:
+def test_an_unheard_peer_has_the_runs_age() -> None:
     outputs = stepped(site(RULE), [TickInput(k) for k in range(40)])
     assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
 
 
-def test_peer_without_share_may_be_as_stale_as_it_likes() -> None:
+def test_peers_without_share_may_be_stale() -> None:
     ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
     assert runs_of(stepped(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
     assert runs_of(stepped(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
 
 
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
-def test_diverged_is_final_from_every_mode(action: StaleAction) -> None:
-    """And forgets what it held: a record that says so holds nothing."""
-    made = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
+def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
+    """A diverged record holds no reference."""
+    stale_site = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
     outputs = stepped(
-        made,
+        stale_site,
         [
             TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else [])
             for k in range(120)
@@ -153,18 +154,20 @@ arrivals = st.lists(
     return_ms=st.integers(1, 60),
     shares=st.sampled_from([(0.5, 0.5), (0.25, 0.75), (1.0, 0.0)]),
 )
-def test_modes_and_references_are_those_of_the_law(
+def test_modes_and_references_follow_the_law(
     heard: list[tuple[bool, bool]],
     action: StaleAction,
     age_ms: int,
     return_ms: int,
     shares: tuple[float, float],
 ) -> None:
-    """Whatever comes and stays away: the edges of `Mode`, and the reference of each mode."""
-    made = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
+    """For any pattern of arrivals: the edges of `Mode`, and the reference of each mode."""
+    stale_site = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
     mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
     for k, flags in enumerate(heard):
-        output = made.step(TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k]))
+        output = stale_site.step(
+            TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k])
+        )
         ages = [k - max(used, 0) for used in output.used]
         stale = any(share > 0 and age > age_ms for share, age in zip(shares, ages, strict=True))
         if action is not StaleAction.USE:
@@ -199,7 +202,7 @@ def test_modes_and_references_are_those_of_the_law(
 
 
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
-def test_the_returning_reference_has_no_step(action: StaleAction) -> None:
+def test_returning_references_have_no_step(action: StaleAction) -> None:
     """Central differences of the reference from the last tick of holding to well within RUN."""
     outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 700)
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
@@ -213,13 +216,11 @@ def test_the_returning_reference_has_no_step(action: StaleAction) -> None:
 
 @pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
-def test_site_resumed_from_two_records_goes_on_with_same_bits(
-    action: StaleAction, k: int
-) -> None:
-    """Whatever its mode was: the records hold what it remembers."""
+def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
+    """In any mode, because the records hold the site's memory."""
     rule = RULE._replace(action=action)
     whole = cut(rule)
-    made = site(rule)
+    stale_site = site(rule)
     last = whole[k - 1]
     in_use = [moving(j, m) for j, m in enumerate(last.used)]
     heard = [
@@ -228,21 +229,21 @@ def test_site_resumed_from_two_records_goes_on_with_same_bits(
         for m in range(last.used[j] + 1, k - 1)
         if not (j and 50 <= m < 90)
     ]
-    made.restore_links(k, in_use, [moving(j, m) for j, m in heard])
-    made.restore_state(whole[k - 2], last)
-    assert stepped(made, cut_ticks()[k:]) == whole[k:]
+    stale_site.restore_links(k, in_use, [moving(j, m) for j, m in heard])
+    stale_site.restore_state(whole[k - 2], last)
+    assert stepped(stale_site, cut_ticks()[k:]) == whole[k:]
 
 
 # What it is good for.
 
 
 @pytest.mark.long
-def test_ramped_return_takes_kick_out_of_healed_link() -> None:
-    """Scenario `outage`: the slave is cut off while its master moves, and hears of it all at once."""
+def test_ramped_returns_remove_kicks_after_outages() -> None:
+    """Scenario `outage`: the slave is cut off while its master moves, and all samples arrive at once."""
 
     def kick(action: str) -> float:
-        made = trajectories(load_scenario("outage", {"on_stale.action": action}))
-        healed = made.sites["s"].t_s >= made.scenario.links["m1->s"].outages_s[0][1]
-        return float(np.abs(made.sites["s"].qd[healed]).max())
+        runs_made = trajectories(load_scenario("outage", {"on_stale.action": action}))
+        healed = runs_made.sites["s"].t_s >= runs_made.scenario.links["m1->s"].outages_s[0][1]
+        return float(np.abs(runs_made.sites["s"].qd[healed]).max())
 
     assert kick("hold") < 0.6 * kick("use")

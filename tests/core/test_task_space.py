@@ -28,8 +28,8 @@ seeds = st.integers(0, 2**32 - 1)
 tasks = pytest.mark.parametrize("task", [PLACE, POSE], ids=["place", "pose"])
 
 
-def place(arrays: SiteArrays, q: Array, qd: Array) -> Row:
-    """The site's row with its end effector placed in a state."""
+def place_row(arrays: SiteArrays, q: Array, qd: Array) -> Row:
+    """Returns the site's row with its end effector placed in a state."""
     s: Row = arrays.site[0]
     s.q, s.qd = q, qd
     place_joints(arrays.chain, s.q)
@@ -59,7 +59,7 @@ def test_rotations_are_those_of_scipy(vector: tuple[float, float, float]) -> Non
 
 @given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 3e-3, 1e-3, 1e-6]))
 @example(vector=(0.6, -0.5, 0.4), rate=(0.3, 0.9, -0.7), shorter=1e-2)
-def test_velocity_of_turn_is_limit_of_differences_and_is_undone(
+def test_turn_velocities_are_limits_of_differences(
     vector: tuple[float, float, float], rate: tuple[float, float, float], shorter: float
 ) -> None:
     turn = (shorter * vector[0], shorter * vector[1], shorter * vector[2])
@@ -79,14 +79,16 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 
 
 @given(seed=seeds)
-def test_velocities_and_rate_of_jacobian_are_limits_of_differences(seed: int) -> None:
+def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
     arrays, q, qd = draw(seed)
     h, m = 1e-6, arrays.site[0].shared
-    before, after = (np.array(place(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0))
-    here = place(arrays, q, qd)
-    assert np.abs((after - before) / (2 * h) - here.Jd).max() <= 1e-7
-    low, high = (np.array(place(arrays, q + sign * h * qd, qd).x) for sign in (-1.0, 1.0))
-    xd = np.array(place(arrays, q, qd).xd)
+    before, after = (
+        np.array(place_row(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0)
+    )
+    row = place_row(arrays, q, qd)
+    assert np.abs((after - before) / (2 * h) - row.Jd).max() <= 1e-7
+    low, high = (np.array(place_row(arrays, q + sign * h * qd, qd).x) for sign in (-1.0, 1.0))
+    xd = np.array(place_row(arrays, q, qd).xd)
     assert np.abs((high - low)[:3] / (2 * h) - xd[:3]).max() <= 1e-7
     if m == 6:
         turn = Rotation.from_rotvec(high[3:]) * Rotation.from_rotvec(low[3:]).inv()
@@ -94,10 +96,10 @@ def test_velocities_and_rate_of_jacobian_are_limits_of_differences(seed: int) ->
 
 
 @given(seed=seeds)
-def test_r_is_what_the_task_asks_whatever_the_posture(seed: int) -> None:
-    """J r = x' + Lambda e wherever nothing is damped."""
+def test_r_follows_the_task_in_any_posture(seed: int) -> None:
+    """J r = x' + Lambda e wherever no axis is damped."""
     arrays, q, qd = draw(seed)
-    s = place(arrays, q, qd)
+    s = place_row(arrays, q, qd)
     s.q_des = np.array(s.x) + 0.01
     s.qd_des = 0.02
     update_task_errors(s)
@@ -105,34 +107,34 @@ def test_r_is_what_the_task_asks_whatever_the_posture(seed: int) -> None:
 
 
 @tasks
-def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(
+def test_reference_acceleration_differentiates_reference_velocity(
     task: TaskSetup,
 ) -> None:
-    """Along a motion whose reference stands: v at a little before and after, and a between them."""
+    """Along a motion whose reference stands still: v shortly before and after, and a between them."""
     arrays = build(task)
     q, h = np.array(arrays.site[0].q), 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
-    x = np.array(place(arrays, q, qd).x)
+    x = np.array(place_row(arrays, q, qd).x)
     x[:3] += 0.05
-    found = []
+    errors = []
     for sign in (-1.0, 0.0, 1.0):
-        s = place(arrays, q + sign * h * qd, qd)
+        s = place_row(arrays, q + sign * h * qd, qd)
         s.q_des, s.qd_des = x, 0.0
         update_task_errors(s)
-        found.append((np.array(s.v), np.array(s.a)))
-    rate = (found[2][0] - found[0][0]) / (2 * h)
+        errors.append((np.array(s.v), np.array(s.a)))
+    rate = (errors[2][0] - errors[0][0]) / (2 * h)
     if task is PLACE:
-        assert np.abs(rate - found[1][1]).max() <= 1e-6
+        assert np.abs(rate - errors[1][1]).max() <= 1e-6
     else:  # the orientation's error is linear in the turn only near 0, where it is here
-        assert np.abs(rate - found[1][1]).max() <= 1e-5
+        assert np.abs(rate - errors[1][1]).max() <= 1e-5
 
 
-def test_damping_begins_below_its_singular_value_and_not_above() -> None:
+def test_damping_begins_below_its_singular_value() -> None:
     arrays = build(PLACE._replace(singular_value=1e-6))
     straight = build(PLACE._replace(singular_value=0.5))
     q, qd = np.array(arrays.site[0].q), np.zeros(7)
     for one, damped in ((arrays, False), (straight, True)):
-        s = place(one, q, qd)
+        s = place_row(one, q, qd)
         s.q_des = np.array(s.x) - 0.1
         update_task_errors(s)
         left = np.abs(s.J @ s.v + s.Lambda * s.e).max()
@@ -140,9 +142,9 @@ def test_damping_begins_below_its_singular_value_and_not_above() -> None:
 
 
 @given(seed=seeds)
-def test_the_wrench_is_the_force_at_the_end_effector(seed: int) -> None:
+def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
     arrays, q, qd = draw(seed)
-    s = place(arrays, q, qd)
+    s = place_row(arrays, q, qd)
     s.q_des = s.x
     update_task_errors(s)
     force = np.arange(1.0, 1.0 + s.shared)
@@ -151,9 +153,9 @@ def test_the_wrench_is_the_force_at_the_end_effector(seed: int) -> None:
     assert s.wrench == pytest.approx(force, rel=1e-6)
 
 
-def test_an_axis_that_is_not_followed_asks_nothing() -> None:
+def test_free_axes_get_no_torque() -> None:
     arrays = build(PLACE._replace(axes=(1.0, 0.0, 1.0)))
-    s = place(arrays, np.array(arrays.site[0].q), np.zeros(7))
+    s = place_row(arrays, np.array(arrays.site[0].q), np.zeros(7))
     s.q_des = np.array(s.x) + np.array([0.0, 0.3, 0.0])
     update_task_errors(s)
     assert np.abs(s.v).max() == 0.0

@@ -20,7 +20,7 @@ def M_of(theta: Array, q: Array) -> Array:
 
 
 def C_of(theta: Array, q: Array, qd: Array) -> Array:
-    """C(q, qd), column by column: Y(q, qd, v, 0) theta without gravity is C v."""
+    """Returns C(q, qd), column by column: Y(q, qd, v, 0) theta without gravity is C v."""
     return np.column_stack([Y_of(0.0, q, qd, v, np.zeros(2)) @ theta for v in np.eye(2)])
 
 
@@ -37,7 +37,7 @@ def near(a: Array, b: Array, scale: float) -> bool:
 
 
 def size(a: ArmLinks) -> float:
-    """An upper bound of the entries of theta."""
+    """Returns an upper bound of the entries of theta."""
     return float(np.abs(theta_from_links(a)).sum())
 
 
@@ -67,9 +67,7 @@ def test_the_inertia_is_symmetric_and_positive_definite(a: ArmLinks, q: Array) -
 
 
 @given(a=links, q=angles, qd=speeds)
-def test_the_inertia_gives_the_kinetic_energy_of_the_masses(
-    a: ArmLinks, q: Array, qd: Array
-) -> None:
+def test_the_inertia_gives_the_masses_energy(a: ArmLinks, q: Array, qd: Array) -> None:
     M = M_of(theta_from_links(a), q)
     energy = physics.kinetic(a, q, qd)
     assert 0.5 * qd @ M @ qd == pytest.approx(energy, rel=1e-11, abs=1e-12 * size(a))
@@ -77,9 +75,7 @@ def test_the_inertia_gives_the_kinetic_energy_of_the_masses(
 
 
 @given(a=links, q=angles, qd=speeds)
-def test_the_coriolis_matrix_is_that_of_the_christoffel_symbols(
-    a: ArmLinks, q: Array, qd: Array
-) -> None:
+def test_the_coriolis_matrix_uses_christoffel_symbols(a: ArmLinks, q: Array, qd: Array) -> None:
     assert near(C_of(theta_from_links(a), q, qd), physics.coriolis(a, q, qd), 20 * size(a))
 
 
@@ -99,7 +95,7 @@ def test_mdot_minus_two_c_is_skew(a: ArmLinks, q: Array, qd: Array, x: Array) ->
 
 
 @given(a=links, g=g_values, q=angles, qd=speeds, v=speeds, acceleration=speeds)
-def test_the_regressor_takes_the_two_velocities_apart(
+def test_the_regressor_separates_the_two_velocities(
     a: ArmLinks, g: float, q: Array, qd: Array, v: Array, acceleration: Array
 ) -> None:
     """Eq. (12): Y(q, qd, v, a) theta = M a + C(q, qd) v + G."""
@@ -113,7 +109,7 @@ def test_the_regressor_takes_the_two_velocities_apart(
 
 
 @given(g=g_values, q=angles, qd=speeds, qdd=speeds)
-def test_with_one_velocity_it_is_the_printed_one(
+def test_with_one_velocity_the_regressor_is_printed(
     g: float, q: Array, qd: Array, qdd: Array
 ) -> None:
     """Eq. (5), with Y12 and Y22 as Section IV prints them."""
@@ -137,7 +133,7 @@ def test_forward_dynamics_solve_the_equation_of_motion(
 
 
 @given(a=links, q=angles)
-def test_the_tip_is_where_the_links_lead(a: ArmLinks, q: Array) -> None:
+def test_the_tip_follows_from_the_links(a: ArmLinks, q: Array) -> None:
     xy = np.array(two_link_arm.forward_kinematics((a.l1_m, a.l2_m), q))
     ends = physics.centres(a._replace(lc1_m=a.l1_m, lc2_m=a.l2_m), q)
     assert near(xy, np.array(ends), 10.0)

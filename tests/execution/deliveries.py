@@ -27,13 +27,13 @@ site_sets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
 
 
 def gaps(size: int, least: int = 1, most: int = 3) -> st.SearchStrategy[dict[str, set[int]]]:
-    """Ticks without a record, of some sites; the last tick has one."""
+    """Draws ticks without a record, of some sites; the last tick has a record."""
     lost = st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=size)
     return st.dictionaries(st.sampled_from(SITES), lost, min_size=least, max_size=most)
 
 
 def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
-    """Holds each sample back until those of the same link before it have come."""
+    """Holds each sample back until the earlier samples of the same link have come."""
     held: dict[Sample, int] = {}
     for receiver in SCENARIO.names:
         for peer in (0, 1):
@@ -45,7 +45,7 @@ def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
 
 
 def delivered(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
-    """A log of a run in which some samples were under way for other than one tick, or never arrive."""
+    """Returns a log of a run in which some samples took other than one tick, or never arrive."""
     at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}
     for receiver, peer, tick in itertools.product(SCENARIO.names, (0, 1), range(TICKS)):
         if (receiver, peer, tick) not in lost:

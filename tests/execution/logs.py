@@ -1,4 +1,4 @@
-"""Logs to ask what if of, and what a rerun of them says of each tick."""
+"""Logs for reruns, and the results of a rerun for each tick."""
 
 import io
 from collections.abc import Collection, Mapping
@@ -19,7 +19,7 @@ OTHER_PLATFORM = {"fingerprint": "0" * 16}
 
 
 def numbers(state: State) -> list[list[float]]:
-    """All that a step computes of a tick but which samples came to it."""
+    """Returns all results of a tick except the arrivals."""
     return [
         *(getattr(state, field) for field in STATE_VECTORS),
         list(state.used.values()),
@@ -28,12 +28,12 @@ def numbers(state: State) -> list[list[float]]:
 
 
 def motion(log: Log, site: str) -> list[tuple[int, str, list[list[float]]]]:
-    """Every tick of a site with its mode and numbers."""
+    """Returns every tick of a site with its mode and numbers."""
     return [(state.tick, state.mode, numbers(state)) for state in log[site].states]
 
 
 def simulated(name: str, overrides: Mapping[str, Any]) -> Log:
-    """A virtual run, by the plain driver."""
+    """Returns a virtual run, by the plain driver."""
     stream = io.BytesIO()
     virtual.write_virtual_log(load_scenario(name, overrides), stream)
     return opened(stream.getvalue())
@@ -44,7 +44,7 @@ def without_records(
     data: bytes | None = None,
     session: dict[str, str] | None = None,
 ) -> Log:
-    """A short log that lacks some records."""
+    """Returns a short log that lacks some records."""
 
     def record(r: dict[str, Any]) -> dict[str, Any] | None:
         return None if r["tick"] in lost.get(r["site"], ()) else r
@@ -55,7 +55,7 @@ def without_records(
 
 
 def all_identical(again: Rerun) -> bool:
-    """True where every record of every site that was executed has the bits of the log."""
+    """True if every executed record of every site has the bits of the log."""
     return all(
         effect.identical == effect.executed == len(again.before[name]) and effect.first is None
         for name, effect in again.sites.items()
@@ -63,7 +63,9 @@ def all_identical(again: Rerun) -> bool:
 
 
 def external_log() -> bytes:
-    """A log as a live session with an arm outside writes it: s moved as nobody here computes."""
+    """Returns a log like that of a live session with an external arm: no model here computes
+    the motion of s.
+    """
     outside = {"sites.s.plant": "external", "sites.s.arm.known": False}
     scenario = load_scenario("two_sites", dict(SHORT) | outside)
     moves = {k: PlantState([0.01 * k, -0.3], [0.25 * (k % 3), 1e-3 * k]) for k in range(TICKS)}

@@ -1,4 +1,4 @@
-"""What a log does not hold, and what was changed in it, passes nothing."""
+"""Missing records and changed records keep a log from passing."""
 
 from collections.abc import Callable
 from functools import cache
@@ -39,7 +39,7 @@ def pieces(*, chained: bool, other: bool = False) -> Pieces:
 
 
 def is_refused(data: bytes, *, chained: bool) -> bool:
-    """True if a log does not pass as whole and identical; one with a chain by that alone."""
+    """True if a log does not pass as whole and identical; a log with a chain, by the chain alone."""
     try:
         log = opened(data)
         if chained:
@@ -49,7 +49,7 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
         return True
 
 
-def test_what_is_put_together_unchanged_is_the_same_file() -> None:
+def test_rewriting_without_changes_keeps_the_file() -> None:
     assert taken_apart(run()).bytes() == run()
     log = opened(run())
     assert judge_integrity(log).state is DigestState.INTACT
@@ -66,7 +66,7 @@ stretches = st.tuples(st.integers(1, TICKS - 2), st.integers(1, 30)).map(
 
 
 def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
-    """Where in a file the records of some sites and ticks are."""
+    """Returns the places in a file of the records of some sites and ticks."""
     topics = taken.topics()
     wanted = {f"/trilat/free/{site}/state" for site in of}
     return [
@@ -82,7 +82,7 @@ def remove(draw: Callable, taken: Pieces) -> None:
 
 
 def splice(draw: Callable, taken: Pieces) -> None:
-    """Another run from some tick on, over a gap or none."""
+    """Returns a log that continues with another run from some tick on, over a gap or none."""
     k, gap = draw(st.integers(TICKS // 2, TICKS - 5)), draw(st.integers(0, 3))
     other = taken_apart(run(other=True)).messages
     topics = taken.topics()
@@ -95,7 +95,9 @@ def splice(draw: Callable, taken: Pieces) -> None:
 
 
 def replay(draw: Callable, taken: Pieces) -> None:
-    """A stretch once more: as it is, or under the numbers that follow, in place of what was there."""
+    """Returns a log with a repeated stretch: unchanged, or with the following tick numbers, in
+    place of the original.
+    """
     of, ticks = draw(sites), draw(stretches)
     again = [taken.messages[n] for n in places(taken, of, ticks)]
     if draw(st.booleans()):
@@ -119,8 +121,16 @@ def renumber(draw: Callable, taken: Pieces) -> None:
 
 
 def change_metadata(draw: Callable, taken: Pieces) -> None:
-    """An entry of any metadata, of a channel's too, changed, added or taken away; or all of it."""
-    entry = draw(st.sampled_from([one for one in taken.about if hasattr(one, "metadata")]))
+    """Changes, adds or removes an entry of any metadata, including a channel's; or removes all metadata."""
+    entry = draw(
+        st.sampled_from(
+            [
+                entry_of_file
+                for entry_of_file in taken.about
+                if hasattr(entry_of_file, "metadata")
+            ]
+        )
+    )
     key = draw(st.sampled_from([*entry.metadata, "new"]))
     match draw(st.sampled_from(["change", "drop", "rename"])):
         case "drop" if key != "new":
@@ -134,14 +144,18 @@ def change_metadata(draw: Callable, taken: Pieces) -> None:
 
 
 def change_description(draw: Callable, taken: Pieces) -> None:
-    """A byte of the scenario or of a schema."""
-    entry = draw(st.sampled_from([one for one in taken.about if hasattr(one, "data")]))
-    place = draw(st.integers(0, len(entry.data) - 1))
-    entry.data = entry.data[:place] + bytes([entry.data[place] ^ 1]) + entry.data[place + 1 :]
+    """Changes a byte of the scenario or of a schema."""
+    entry = draw(
+        st.sampled_from(
+            [entry_of_file for entry_of_file in taken.about if hasattr(entry_of_file, "data")]
+        )
+    )
+    index = draw(st.integers(0, len(entry.data) - 1))
+    entry.data = entry.data[:index] + bytes([entry.data[index] ^ 1]) + entry.data[index + 1 :]
 
 
 def change_message(draw: Callable, taken: Pieces) -> None:
-    """A time, or the telemetry of a record, which no execution computes; or any message taken out."""
+    """Changes a time, or the telemetry of a record, which no execution computes; or removes any message."""
     n = draw(st.integers(0, len(taken.messages) - 1))
     message = taken.messages[n]
     match draw(st.sampled_from(["log_ns", "publish_ns", "telemetry", "out"])):
@@ -171,11 +185,11 @@ def refuses_all(changes: list[Callable], *, chained: bool, examples: int) -> Non
 
 
 @pytest.mark.push
-def test_no_change_of_a_log_passes_by_its_chain() -> None:
+def test_chained_logs_reveal_any_change() -> None:
     refuses_all(ANY, chained=True, examples=150)
 
 
-def test_no_change_of_the_records_of_an_older_log_passes() -> None:
+def test_unchained_records_reveal_any_change() -> None:
     refuses_all(OF_RECORDS, chained=False, examples=40)
 
 
@@ -185,8 +199,8 @@ def test_of_500_changed_logs_none_passes(chained: bool, changes: list[Callable])
     refuses_all(changes, chained=chained, examples=500)
 
 
-def test_two_runs_over_a_gap_are_refused_without_a_chain() -> None:
-    """The same experiment, the same starts of its sites: what follows the gap was still another run."""
+def test_two_runs_over_a_gap_are_refused() -> None:
+    """The same experiment and the same starts of its sites: another run follows the gap."""
     taken = pieces(chained=False)
     other = taken_apart(run(other=True)).messages
     topics = taken.topics()
@@ -194,12 +208,12 @@ def test_two_runs_over_a_gap_are_refused_without_a_chain() -> None:
         m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
     ]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
-    found = judge_integrity(opened(taken.bytes()))
-    assert found.state is DigestState.CHANGED
-    assert "were removed or added" in found.text
+    integrity = judge_integrity(opened(taken.bytes()))
+    assert integrity.state is DigestState.CHANGED
+    assert "were removed or added" in integrity.text
 
 
-def test_sparse_logs_fail_and_say_how_much_was_judged() -> None:
+def test_sparse_logs_fail_with_the_judged_share() -> None:
     log = without_records({"m1": range(2, 100)})
     verdict = verify(log)
     assert verdict.agreed
@@ -211,7 +225,7 @@ def test_sparse_logs_fail_and_say_how_much_was_judged() -> None:
     assert "less than 99.9 %" in text
 
 
-def test_a_torn_log_passes_no_more_than_is_asked_for() -> None:
+def test_torn_logs_pass_no_more_than_asked() -> None:
     data = edited(recorded("paper"), chunk_bytes=2048)
     log = opened(data[: len(data) // 2])
     assert not verify(log).passed
@@ -225,8 +239,8 @@ def test_a_torn_log_passes_no_more_than_is_asked_for() -> None:
     )
 
 
-def test_records_of_another_start_are_found_where_nothing_is_executed() -> None:
-    """The two records behind a gap are not executed; whose they are is compared all the same."""
+def test_foreign_records_are_found_without_execution() -> None:
+    """The two records behind a gap are not executed, but their start is compared."""
 
     def record(r: dict) -> dict | None:
         changed = {**r, "boot": 1} if (r["site"], r["tick"]) == ("s", 45) else r
@@ -237,7 +251,7 @@ def test_records_of_another_start_are_found_where_nothing_is_executed() -> None:
     assert first[:3] == ("s", 45, "boot")
 
 
-def test_a_log_claiming_to_be_a_rerun_is_executed_whole() -> None:
+def test_a_claimed_rerun_is_executed_whole() -> None:
     def zeroed(r: dict) -> dict:
         return r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}
 
@@ -250,26 +264,27 @@ def test_a_log_claiming_to_be_a_rerun_is_executed_whole() -> None:
     assert not worse.passed
 
 
-def test_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> None:
+def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(recorded("free"))
-    made = tmp_path / "again.mcap"
-    rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(made)
-    verdict = verify(open_log(made))
+    log_path = tmp_path / "again.mcap"
+    rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(log_path)
+    verdict = verify(open_log(log_path))
     assert verdict.passed
     assert verdict.identical == 3 * TICKS
     forged = edited(
-        made.read_bytes(), record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r
+        log_path.read_bytes(),
+        record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r,
     )
-    made.write_bytes(forged)
-    assert verify(open_log(made)).first[:3] == ("m1", 0, "record")
+    log_path.write_bytes(forged)
+    assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
     (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")
-    alone = run_log_checks(open_log(made), virtual=True)
+    alone = run_log_checks(open_log(log_path), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)
 
 
-def test_lost_samples_excuse_virtual_time_only_after_them() -> None:
+def test_lost_samples_excuse_virtual_time_afterwards() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
     log = opened(delivered({}, lost))
     report = run_log_checks(log, virtual=True)
@@ -287,23 +302,23 @@ def test_lost_samples_excuse_virtual_time_only_after_them() -> None:
     assert not changed.findings[-1].passed
 
 
-def test_a_gap_fails_no_virtual_time_fed_with_possible_arrivals() -> None:
+def test_gaps_pass_with_possible_arrivals() -> None:
     lines = run_log_checks(without_records({"m2": [50, 51]}), virtual=True).findings
     fed = next(line for line in lines if "fed" in line.check)
     assert fed.passed, fed
 
 
-def test_coverage_is_that_of_the_site_with_the_least() -> None:
-    found = Coverage({"a": 1000, "b": 995}, {"a": 1000, "b": 1000, "c": 0})
-    assert found.share == 0.995
-    assert str(found) == "b 995 of 1000 ticks (99.5 %)"
+def test_coverage_is_the_least_of_all_sites() -> None:
+    coverage = Coverage({"a": 1000, "b": 995}, {"a": 1000, "b": 1000, "c": 0})
+    assert coverage.share == 0.995
+    assert str(coverage) == "b 995 of 1000 ticks (99.5 %)"
     assert Coverage({}, {}).share == 0.0
     assert Coverage({"a": 0}, {"a": 0}).share == 0.0
     assert "99.999 %" in str(Coverage({"a": 10**7 - 1}, {"a": 10**7}))
     assert options.MIN_COVERAGE == MIN_COVERAGE
 
 
-def test_site_that_others_lost_ends_where_it_was_last_seen() -> None:
+def test_lost_sites_end_where_last_seen() -> None:
     whole = opened(recorded("paper"))
     assert {whole.expected_ticks(site) for site in SITES} == {TICKS}
     data = edited(recorded("paper"), chunk_bytes=2048)

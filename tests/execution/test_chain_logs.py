@@ -1,4 +1,4 @@
-"""Logs of arms of six joints: every record, executed again and in virtual time, has the same bits."""
+"""Logs of arms of six joints: every record has the same bits when executed again and in virtual time."""
 
 import io
 import math
@@ -21,26 +21,26 @@ N, TICKS = 6, 80
 
 
 @cache
-def made() -> bytes:
-    """A run of which 20 ms are the delay of every link."""
+def record_chain_log() -> bytes:
+    """Returns a run in which every link delays by 20 ms."""
     stream = io.BytesIO()
     write_virtual_log(parse_scenario(six_joints(TICKS / 1000)), stream)
     return stream.getvalue()
 
 
 def changed(field: str, numbers: int) -> Log:
-    """The log whose slave has that many numbers in a vector of one record."""
+    """Returns the log whose slave has that many numbers in a vector of one record."""
 
     def change(record: Record) -> Record:
         if (record["site"], record["tick"]) == ("s", 40):
             record[field] = (record[field] * 2)[:numbers]
         return record
 
-    return opened(edited(made(), record=change))
+    return opened(edited(record_chain_log(), record=change))
 
 
-def test_six_joints_executed_again_are_virtual_time() -> None:
-    log = opened(made())
+def test_six_joints_executed_again_equal_virtual_time() -> None:
+    log = opened(record_chain_log())
     verdict, twins = verify(log), compare_with_virtual(log)
     assert verdict.passed, str(verdict.first)
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -51,10 +51,11 @@ def test_six_joints_executed_again_are_virtual_time() -> None:
     assert (log["s"].q[-1] != log["s"].q[0]).all()
 
 
-def test_a_gap_of_six_joints_is_resumed_from_two_records() -> None:
+def test_two_records_resume_six_joints() -> None:
     log = opened(
         edited(
-            made(), record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r
+            record_chain_log(),
+            record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r,
         )
     )
     verdict = verify(log)
@@ -65,7 +66,7 @@ def test_a_gap_of_six_joints_is_resumed_from_two_records() -> None:
 @pytest.mark.parametrize(
     ("field", "numbers"), [("q", 5), ("q", 7), ("tau", 2), ("theta_hat", 5)]
 )
-def test_a_record_with_another_number_of_joints_is_refused(field: str, numbers: int) -> None:
+def test_records_with_other_joints_are_refused(field: str, numbers: int) -> None:
     log = changed(field, numbers)
     with pytest.raises(
         LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"
@@ -81,7 +82,7 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
             record["qd"][N - 1] = math.nextafter(record["qd"][N - 1], math.inf)
         return record
 
-    first = verify(opened(edited(made(), record=change))).first
+    first = verify(opened(edited(record_chain_log(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
 
@@ -103,25 +104,27 @@ PLANAR |= {"l2_m": 0.9, "m2_kg": 0.8, "lc2_m": 0.3, "I2_kg_m2": 0.07}
 
 
 @pytest.mark.long
-def test_planar_arm_written_as_chain_makes_same_run() -> None:
-    """Unrolled and recursive leaves: every angle, speed and torque of both laws, with operators that push."""
+def test_a_planar_arm_equals_its_chain() -> None:
+    """Unrolled and recursive leaves: every angle, speed and torque of both laws, with operators
+    that push.
+    """
     for law in ({"law": "adaptive", "Gamma": 0.0}, {"law": "p_d", "K": 30.0, "d": 4.0}):
         logs = []
         for arm in (PLANAR, {"urdf": "two.urdf", "down": [0.0, -1.0, 0.0]}):
-            given = {
+            settings = {
                 "arm": arm,
                 "control": law,
                 "duration_s": 2.0,
                 "expect": {},
                 "limits.qd_limit_rad_s": 100.0,
             }
-            given |= {"limits.tau_limit_nm": 200.0} | (
+            settings |= {"limits.tau_limit_nm": 200.0} | (
                 {"urdf": {"two.urdf": TWO_LINKS}} if "urdf" in arm else {}
             )
-            plain = load_scenario("paper", given)
+            plain = load_scenario("paper", settings)
             if law["law"] == "adaptive":
-                given["control"] = {**law, "theta_hat0": plain.arms["s"].theta.tolist()}
-            logs.append(simulate_scenario(load_scenario("paper", given)))
+                settings["control"] = {**law, "theta_hat0": plain.arms["s"].theta.tolist()}
+            logs.append(simulate_scenario(load_scenario("paper", settings)))
         for site in logs[0].sites:
             for name in ("q", "qd", "tau", "q_des"):
                 planar, chain = (getattr(log[site], name) for log in logs)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.core.compiled import printed
+from tests.core.compiled import run_program
 from tests.execution.varying_links import VARYING_LINKS
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
@@ -63,15 +63,15 @@ def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
 
 def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
-    found = np.full(
+    maxima = np.full(
         (len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0
     )
     for k, output in enumerate(outputs):
         error = max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         speed = max(map(abs, output.qd))
         n = k * BUCKETS_PER_S // rate_hz
-        found[n] = np.maximum(found[n], (error, speed))
-    return found
+        maxima[n] = np.maximum(maxima[n], (error, speed))
+    return maxima
 
 
 def agree(scenario: Scenario) -> None:
@@ -81,8 +81,8 @@ def agree(scenario: Scenario) -> None:
     for record, outputs in zip(fused.records, expected.values(), strict=True):
         last = floats(outputs[-1])
         np.testing.assert_array_equal(record[: len(last)], last)
-    for found, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
-        np.testing.assert_array_equal(found, buckets(outputs, scenario.sites[name].rate_hz))
+    for maximum, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
+        np.testing.assert_array_equal(maximum, buckets(outputs, scenario.sites[name].rate_hz))
     stops = [
         o.t_ns * 1e-9
         for outputs in expected.values()
@@ -106,7 +106,7 @@ def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
     rates=st.tuples(*[st.sampled_from([7, 100, 333, 1000])] * 3),
     seed=st.integers(0, 9),
 )
-def test_whatever_the_links_the_rates_and_the_scheme(
+def test_any_links_rates_and_schemes_agree(
     name: str, scheme: str, link: Mapping[str, Any], rates: tuple[int, ...], seed: int
 ) -> None:
     changes = {
@@ -117,7 +117,7 @@ def test_whatever_the_links_the_rates_and_the_scheme(
     agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
 
 
-def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
+def test_diverging_runs_end_with_that_tick() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
     agree(scenario)
     fused = FusedRun(scenario)
@@ -130,7 +130,7 @@ def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(stops=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=5))
-def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
+def test_a_split_run_equals_the_whole_run(stops: list[float]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})
     whole, parts = FusedRun(scenario), FusedRun(scenario)
     whole.advance_to(1.0)
@@ -166,13 +166,13 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     fused.advance_to(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
     whole = {
-        one.key: compute_log_metrics(log).run_value(one).value
-        for one in quantities()
-        if one.key in TOTALS
+        quantity.key: compute_log_metrics(log).run_value(quantity).value
+        for quantity in quantities()
+        if quantity.key in TOTALS
     }
-    found = fused.totals._asdict()
+    totals = fused.totals._asdict()
     for key in TOTALS:
-        assert found[key] == (
+        assert totals[key] == (
             whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)
         ), key
     squares = []
@@ -181,22 +181,22 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
         outer = 9.81 * theta[4] * np.cos(q[:, 0] + q[:, 1])
         gravity = np.stack((9.81 * theta[3] * np.cos(q[:, 0]) + outer, outer), axis=1)
         squares.append(np.mean((tau - gravity) ** 2))
-    assert found["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
+    assert totals["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
 
 
 @pytest.mark.long
-def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
+def test_settling_is_the_last_error_limit_crossing() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
     fused = FusedRun(scenario, settled_rad=0.01)
     fused.advance_to(13.0)
-    apart = [
+    late_times_s = [
         output.t_ns
         for outputs in per_tick(scenario).values()
         for output in outputs
         if max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         >= 0.01
     ]
-    assert fused.settled_s == max(apart) / 1e9
+    assert fused.settled_s == max(late_times_s) / 1e9
     early = FusedRun(scenario, settled_rad=0.01)
     early.advance_to(2.0)
     assert early.settled_s is None
@@ -219,12 +219,12 @@ for scheme in ("second_order", "digital"):
 
 @pytest.mark.long
 def test_without_the_compiler_it_has_the_same_bits() -> None:
-    plain = printed(_PROGRAM, compiled=False)
+    plain = run_program(_PROGRAM, compiled=False)
     assert plain.count("\n") == 8
-    assert plain == printed(_PROGRAM, compiled=True)
+    assert plain == run_program(_PROGRAM, compiled=True)
 
 
-def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
+def test_unsupported_runs_are_refused() -> None:
     with pytest.raises(
         ScenarioError, match=r"sites\.m1\.plant: is external: .* can only run live"
     ):
@@ -234,7 +234,7 @@ def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
 
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
-def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
+def test_plugged_laws_have_per_tick_bits(law: str) -> None:
     """One law among those of the kernel, which send nothing; and all sites, at two rates."""
     plugged = {"link.delay_ms": 5.0, "duration_s": 0.2}
     line = f"tests.plugged_laws:{law}"
@@ -254,7 +254,7 @@ def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
-def test_a_law_that_fails_in_a_fused_run_is_named(law: str) -> None:
+def test_failing_laws_in_fused_runs_are_named(law: str) -> None:
     control = {"law": f"tests.plugged_laws:{law}", "fail_at": 42}
     run = FusedRun(
         load_scenario("asymmetric", {"link.delay_ms": 5.0, "sites.m2.control": control})

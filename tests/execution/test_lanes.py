@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from tests.execution.varying_links import VARYING_LINKS
+from trilat_net.core.step.row_fields import FIELDS
+from trilat_net.errors import LawFailed
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.lanes import LANES, LEAST_RUNS, find_obstacle, group_runs
@@ -27,12 +29,25 @@ STRUCTURES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("free", {}),
     ("p_d_margin", {}),
     ("windup", {}),
+    ("two_sites", {"control.law": "wave", "scheme": "digital"}),
+    ("free", {"control.law": "tdpa", "scheme": "digital", "control.B": 5.0}),
+    ("two_sites", {"control.law": "four_channel", "scheme": "digital"}),
     ("free", {"scheme": "digital", "rate_hz": 333}),
     ("asymmetric", {}),
     ("contact", {}),
     ("free", {"sites.s.on_stale": {"action": "hold", "age_ms": 205.0}}),
+    ("six_joints", {}),
+    ("wall_in_space", {}),
+    ("six_joints", {"control.law": "p_d", "limits.tau_rate_limit_nm_s": 500.0}),
+    ("six_joints", {"scheme": "digital", "rate_hz": 500}),
 )
-"""Scenarios whose runs differ in their equations; the quick tests use the first three."""
+"""Scenarios whose runs differ in their equations; the quick tests use the first four."""
+QUICK = STRUCTURES[:4]
+ADAPTIVE = ("free", "windup", "asymmetric", "six_joints", "wall_in_space")
+LAWS = ("tanks", "smith", "authority", "saturated_pd", "pd_d")
+STRUCTURES += tuple(("two_sites", {"control.law": law, "scheme": "digital"}) for law in LAWS)
+GAINS = {"wave": "control.b", "tdpa": "control.K", "four_channel": "control.K"}
+"""A gain of each law that is not a part of the kernel."""
 
 
 def draw_cells(
@@ -41,10 +56,16 @@ def draw_cells(
     """Cells of one structure, each with gains, links and a seed of its own."""
     name, settings = structure
     base = load_scenario(name, {"duration_s": 0.6, **settings})
-    gain = "control.Kd" if name in ("free", "windup", "asymmetric") else "control.d"
+    gain = "control.Kd" if name in ADAPTIVE else "control.d"
+    law = settings.get("control.law", "")
+    gain = GAINS.get(law, "control.d" if law == "p_d" else gain)
+    has_gain = settings.get("control.law") not in LAWS
+    factor = 10.0 if gain in GAINS.values() else 1.0
     cells = []
     for _ in range(count):
-        numbers = {gain: draws.uniform(0.5, 3.0), "seed": draws.randrange(1000)}
+        numbers: dict[str, float] = {"seed": draws.randrange(1000)}
+        if has_gain:
+            numbers[gain] = factor * draws.uniform(0.5, 3.0)
         cells.append(load_scenario(base, {**draws.choice(LINKS), **numbers}))
     return cells
 
@@ -52,14 +73,17 @@ def draw_cells(
 def read_numbers(run: FusedRun) -> dict[str, bytes]:
     """Everything that a run computes, by field, without entries of rings that are not in use."""
     memory = run.memory
-    numbers = {
-        f"site.{name}": memory.tables.site[name] for name in memory.tables.site.dtype.names
-    }
+    site = memory.tables.site
+    # Nothing reads intermediate results of an earlier tick.
+    kept = [name for name in site.dtype.names if FIELDS["site"][name].stage != "scratch"]
+    numbers = {f"site.{name}": site[name] for name in kept}
     numbers |= {f"sums.{name}": memory.sums[name] for name in memory.sums.dtype.names}
     numbers |= {
         f"progress.{name}": memory.progress[name] for name in memory.progress.dtype.names
     }
     numbers |= {"peaks": memory.peaks, "records": run.records}
+    if memory.laws is not None:
+        numbers |= {"laws": memory.laws.rows, "sent": memory.laws.sent}
     return {name: np.ascontiguousarray(array).tobytes() for name, array in numbers.items()}
 
 
@@ -90,22 +114,52 @@ def check_cells(cells: Sequence[Scenario]) -> None:
         check_equal(run, run_alone(cell))
 
 
-@pytest.mark.parametrize("structure", STRUCTURES[:3], ids=lambda structure: structure[0])
+@pytest.mark.parametrize("structure", QUICK, ids=lambda structure: structure[0])
 @pytest.mark.parametrize("count", [LANES, 5])
-def test_every_lane_has_the_bits_of_its_run_alone(
+def test_lanes_have_the_bits_of_single_runs(
     structure: tuple[str, dict[str, Any]], count: int
 ) -> None:
     check_cells(draw_cells(random.Random(count), structure, count))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("cells", [400, 2000])
-def test_random_cells_have_the_bits_of_their_runs_alone(cells: int) -> None:
+def check_random_cells(structures: Sequence[tuple[str, dict[str, Any]]], cells: int) -> None:
+    """Checks so many cells of random structures, in groups of random sizes."""
     draws = random.Random(cells)
     while cells > 0:
         count = draws.randint(1, LANES)
-        check_cells(draw_cells(draws, draws.choice(STRUCTURES), count))
+        check_cells(draw_cells(draws, draws.choice(structures), count))
         cells -= count
+
+
+def test_400_random_cells_have_the_bits_of_their_runs_alone() -> None:
+    check_random_cells(QUICK, 400)
+
+
+@pytest.mark.long
+def test_2000_random_cells_have_the_bits_of_their_runs_alone() -> None:
+    check_random_cells(STRUCTURES, 2000)
+
+
+def test_chains_have_the_bits_of_their_runs_alone() -> None:
+    """With friction, stops and a robust term, and limits that some runs leave."""
+    law = {"control.law": "adaptive_robust", "control.rho_nm": 0.5}
+    base = load_scenario("six_joints", {"duration_s": 0.4, **law})
+    draws = random.Random(11)
+    cells = [
+        load_scenario(
+            base,
+            {
+                **draws.choice(LINKS),
+                "control.Kd": draws.uniform(0.5, 2.0),
+                "limits.qd_limit_rad_s": draws.choice([0.3, 10.0]),
+            },
+        )
+        for _ in range(9)
+    ]
+    check_cells(cells)
+    ends_s = [run_alone(cell).diverged_s for cell in cells]
+    assert None in ends_s
+    assert len(set(ends_s)) > 1
 
 
 def test_lane_has_the_bits_of_site_step() -> None:
@@ -153,11 +207,30 @@ def test_runs_continue_in_lanes_or_alone() -> None:
         assert (runs[index].memory.next_samples == alone.memory.next_samples).all()
 
 
+def test_only_the_run_whose_law_fails_ends() -> None:
+    """Some laws of users fail in a tick of their own, if the numbers of their run say so."""
+    line = {"law": "tests.plugged_laws:CompiledLine"}
+    base = load_scenario("asymmetric", {"link.delay_ms": 5.0, "duration_s": 0.2})
+    cells = [
+        load_scenario(base, {"sites.m2.control": {**line, "K": 15.0 + n, "fail_at": fail_at}})
+        for n, fail_at in enumerate([-1, -1, 150, -1, 42])
+    ]
+    runs = [FusedRun(cell) for cell in cells]
+    (group,) = group_runs(runs)
+    group.advance_to(0.03)
+    for run, cell in zip(runs, cells, strict=True):
+        check_equal(run, run_alone(cell, 0.03))
+    with pytest.raises(LawFailed, match="m2 failed at tick 149: ZeroDivisionError"):
+        group.advance_to(0.2)
+    for run, cell in zip(runs[:2], cells[:2], strict=True):
+        check_equal(run, run_alone(cell, 0.03, 0.2))
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "obstacle"),
     [
-        ("six_joints", {}, "arms that are chains of joints"),
-        ("free", {"control.law": "tdpa", "scheme": "digital"}, "laws that the kernel"),
+        ("unlike_arms", {}, "share poses"),
+        ("six_joints", {"control.law": "pd_d"}, ""),
         ("free", {"sites.s.rate_hz": 500}, "tick rates that differ"),
         ("play", {}, "hands that move an arm live"),
         ("free", {"sites.s.on_stale": {"action": "glide"}}, "glide"),
@@ -165,10 +238,11 @@ def test_runs_continue_in_lanes_or_alone() -> None:
 )
 def test_obstacles_are_named(name: str, settings: dict[str, Any], obstacle: str) -> None:
     run = FusedRun(load_scenario(name, {"duration_s": 0.1, **settings}))
+    assert bool(obstacle) == bool(find_obstacle(run))
     assert obstacle in find_obstacle(run)
 
 
-def test_groups_have_one_structure_and_few_runs_stay_alone() -> None:
+def test_groups_share_structure_and_small_groups_split() -> None:
     free = [FusedRun(load_scenario("free", {"duration_s": 0.1})) for _ in range(LANES + 1)]
     longer = [
         FusedRun(load_scenario("free", {"duration_s": 0.2})) for _ in range(LEAST_RUNS - 1)

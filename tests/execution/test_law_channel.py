@@ -1,4 +1,4 @@
-"""What laws send to their peers: it comes to whom it is for, stands in the records, and is executed again."""
+"""Messages between laws reach their receivers, stand in the records, and are executed again."""
 
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,8 @@ def talk(**more: Any) -> bytes:
     return recorded("paper", {**SHORT, **more})
 
 
-def test_each_peer_gets_its_own_vector_and_the_common_one() -> None:
-    """The energy that a site states, from the records of its peers alone: what is for others is not in it."""
+def test_peers_get_own_and_common_vectors() -> None:
+    """The energy that a site states, from the records of its peers alone, without the parts for others."""
     log = opened(talk())
     alpha = log.scenario.dominance
     for site in SITES:
@@ -45,13 +45,15 @@ def test_each_peer_gets_its_own_vector_and_the_common_one() -> None:
                 10.0 * alpha[site].get(peer, 0.0) * ((heard - log[site].q) ** 2).sum(axis=1)
             )
         assert log[site].sent["energy"][:, 0] == pytest.approx(energy, rel=1e-12)
-        told = [log[site].sent[f"target[{peer}]"] - log[site].q for peer in log[site].peers]
+        differences = [
+            log[site].sent[f"target[{peer}]"] - log[site].q for peer in log[site].peers
+        ]
         # the same for both joints
-        assert all(np.ptp(one, axis=1).max() < 1e-12 for one in told)
-        assert np.abs(told[0] - told[1]).min() > 5e-3  # and other for each peer
+        assert all(np.ptp(difference, axis=1).max() < 1e-12 for difference in differences)
+        assert np.abs(differences[0] - differences[1]).min() > 5e-3  # and other for each peer
 
 
-def test_it_is_executed_again_and_equals_virtual_time() -> None:
+def test_messages_are_executed_again_like_virtual_time() -> None:
     log = opened(talk())
     verdict = verify(log)
     assert verdict.whole_run
@@ -64,8 +66,8 @@ def test_it_is_executed_again_and_equals_virtual_time() -> None:
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_behind_a_gap_it_goes_on_from_records(session: dict[str, str] | None) -> None:
-    """As much can be judged as without a word between laws, and all of it agrees."""
+def test_behind_gaps_messages_continue_from_records(session: dict[str, str] | None) -> None:
+    """As much can be judged as without messages between laws, and all of it agrees."""
     verdict = verify(without_records({"s": range(50, 61)}, talk(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
@@ -93,10 +95,8 @@ def test_a_changed_number_shows_at_its_own_tick(
 
 
 @pytest.mark.parametrize(("place", "differing"), [(0, 3), (1, 2), (3, 2)])
-def test_the_sum_of_arrivals_covers_exactly_what_a_site_gets(
-    place: int, differing: int
-) -> None:
-    """A number that comes too late to be used shows where it came: at both peers, or at the one."""
+def test_arrival_sums_cover_exactly_the_received_numbers(place: int, differing: int) -> None:
+    """A number that comes too late to be used shows at its arrival: at both peers, or at the one."""
 
     def record(r: Record) -> Record:
         if (r["site"], r["tick"]) == ("m2", TICKS - 2):
@@ -106,7 +106,7 @@ def test_the_sum_of_arrivals_covers_exactly_what_a_site_gets(
     assert verify(opened(edited(talk(), record=record))).differing == differing
 
 
-def test_record_whose_law_sent_more_or_less_cannot_be_read() -> None:
+def test_records_with_wrong_law_messages_are_unreadable() -> None:
     def record(r: Record) -> Record:
         return {**r, "ch": r["ch"][:-1]}
 
@@ -115,25 +115,29 @@ def test_record_whose_law_sent_more_or_less_cannot_be_read() -> None:
         log["m1"].ch  # noqa: B018
 
 
-def test_viewers_get_a_channel_per_vector_with_its_unit(tmp_path: Path) -> None:
+def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     virtual.record_virtual(load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ)
     channels = read_ros2_channels(path)
     about = {
-        topic.rpartition("/")[2]: one.about
-        for topic, one in channels.items()
+        topic.rpartition("/")[2]: channel_data.about
+        for topic, channel_data in channels.items()
         if "/viz/m2/" in topic
     }
-    sent = {name: one["unit"] for name, one in about.items() if name.startswith("sent_")}
+    sent = {
+        name: entry_of_file["unit"]
+        for name, entry_of_file in about.items()
+        if name.startswith("sent_")
+    }
     assert sent == {"sent_energy": "J", "sent_target_to_m1": "rad", "sent_target_to_s": "rad"}
     log = open_log(path)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        shown = [
-            [*one[3].data]
-            for one in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])
+        vectors = [
+            [*message[3].data]
+            for message in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])
         ]
-    assert shown == log["m2"].sent["target[s]"].tolist()
+    assert vectors == log["m2"].sent["target[s]"].tolist()
     page = build_plot_layout(channels).pages["Sent by laws"]
     assert [plot.title for plot in page[0]] == [
         f"{site}: energy that the law sends to all (J)" for site in SITES
@@ -141,13 +145,13 @@ def test_viewers_get_a_channel_per_vector_with_its_unit(tmp_path: Path) -> None:
     assert page[1][0].curves[0].names == ("target1", "target2")
 
 
-def test_tables_name_what_was_sent_with_its_unit() -> None:
+def test_tables_name_messages_with_their_units() -> None:
     log = opened(talk())
     table = log.table("m2", "state")
     columns = {
         column.source: column for column in table.columns if column.source.startswith("ch.")
     }
-    assert {source: (one.name, one.unit) for source, one in columns.items()} == {
+    assert {source: (data.name, data.unit) for source, data in columns.items()} == {
         "ch.energy[0]": ("ch_energy_j", "J"),
         "ch.target[m1][0]": ("ch_target_m1_1_rad", "rad"),
         "ch.target[m1][1]": ("ch_target_m1_2_rad", "rad"),

@@ -1,4 +1,4 @@
-"""A log repeats who held an arm: verified, in fed virtual time, and executed again."""
+"""A log repeats the hold of an arm by a person: verified, in fed virtual time, and executed again."""
 
 import msgspec
 import numpy as np
@@ -24,7 +24,7 @@ SECONDS = 1.2
 
 
 class CirclingHand:
-    """Holds an arm from 0.2 s to 0.7 s and leads it, 60 messages a second; then it is silent."""
+    """Holds an arm from 0.2 s to 0.7 s and leads it, 60 messages a second; then the hand is silent."""
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._arm, spec = scenario.arms[site], scenario.sites[site]
@@ -51,41 +51,43 @@ class CirclingHand:
 
 
 @pytest.fixture(scope="module", params=["tip", "joint", "force"])
-def held(request: pytest.FixtureRequest) -> Log:
-    """A run in which somebody held m1 in each way."""
+def held_log(request: pytest.FixtureRequest) -> Log:
+    """Returns a run in which a person held m1 in each way."""
     live = [{"kind": "live", "mode": request.param}]
     scenario = load_scenario("paper", {"duration_s": SECONDS, "sites.m1.hands": live})
     return simulate_scenario(scenario, hands={"m1": CirclingHand(scenario, "m1")})
 
 
-def test_a_log_of_people_is_verified_and_repeated(held: Log) -> None:
-    found = verify(held)
-    assert found.passed
-    assert found.identical == found.records == 3 * round(SECONDS * 1000)
-    compared = compare_with_virtual(held)
-    assert compared.fed.identical == compared.plain.identical == found.records
-    again = rerun(held, replace=["m1"])
+def test_logs_of_people_are_verified_and_repeated(held_log: Log) -> None:
+    verification = verify(held_log)
+    assert verification.passed
+    assert verification.identical == verification.records == 3 * round(SECONDS * 1000)
+    compared = compare_with_virtual(held_log)
+    assert compared.fed.identical == compared.plain.identical == verification.records
+    again = rerun(held_log, replace=["m1"])
     assert again.sites["m1"].identical == round(SECONDS * 1000)
-    assert np.abs(held["m1"].tau_x).max() > 1.0
+    assert np.abs(held_log["m1"].tau_x).max() > 1.0
 
 
-def test_the_force_is_zero_at_both_ends(held: Log) -> None:
-    """The torque by the definition, from the log's own numbers, is the record's, to rounding."""
-    part = held["m1"]
+def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
+    """The torque by the definition, from the log's own numbers, equals the record's, to rounding."""
+    part = held_log["m1"]
     grip = part.hand[:, 0]
     torque = np.abs(part.tau_x).max(axis=1)
     assert not torque[grip == 0.0].any()
     assert part.t_s[grip > 0.0].max() == pytest.approx(0.7 + 0.2 + 0.1, abs=0.03)
-    own = align_records(held)["m1"]
-    split = split_torque(own, held.scenario)
-    source = held.scenario.sites["m1"].hands[0].actor
-    expected = compute_live_torque(source, own.hand, own.q, own.qd, split.end_effector)
-    assert expected == pytest.approx(-own.tau_x, abs=1e-9)
+    records = align_records(held_log)["m1"]
+    split = split_torque(records, held_log.scenario)
+    source = held_log.scenario.sites["m1"].hands[0].actor
+    expected = compute_live_torque(
+        source, records.hand, records.q, records.qd, split.end_effector
+    )
+    assert expected == pytest.approx(-records.tau_x, abs=1e-9)
     assert split.operator == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_table_of_records_names_what_the_hand_did(held: Log) -> None:
-    table, mode = held.table("m1"), held.scenario.sites["m1"].hands[0].mode
+def test_record_tables_name_the_hands_values(held_log: Log) -> None:
+    table, mode = held_log.table("m1"), held_log.scenario.sites["m1"].hands[0].mode
     first = {
         "tip": "hand_target_x_m",
         "joint": "hand_target_q1_rad",
@@ -93,25 +95,25 @@ def test_a_table_of_records_names_what_the_hand_did(held: Log) -> None:
     }[mode]
     column = table[first]
     assert column.known is not None
-    assert np.array_equal(column.known, held["m1"].hand[:, 2] == 7)
-    assert np.array_equal(column.values, held["m1"].hand[:, 3])
+    assert np.array_equal(column.known, held_log["m1"].hand[:, 2] == 7)
+    assert np.array_equal(column.values, held_log["m1"].hand[:, 3])
     assert table["hand_number"].rows(300, 301) == [289]
 
 
-def test_a_changed_hand_is_found(held: Log) -> None:
-    """A nanometre of a target in a record, or a nanonewton of a force, is another run."""
-    states = held["m1"].states
+def test_a_changed_hand_is_found(held_log: Log) -> None:
+    """A nanometre of a target in a record, or a nanonewton of a force, makes another run."""
+    states = held_log["m1"].states
     hand = [*states[400].hand]
     hand[3] += 1e-9
     changed = [*states]
     changed[400] = msgspec.structs.replace(states[400], hand=hand)
-    held["m1"].__dict__["states"] = changed
+    held_log["m1"].__dict__["states"] = changed
     try:
-        found = verify(held)
+        verification = verify(held_log)
     finally:
-        held["m1"].__dict__["states"] = states
-    assert found.first is not None
-    assert (found.first.site, found.first.tick) == ("m1", 400)
+        held_log["m1"].__dict__["states"] = states
+    assert verification.first is not None
+    assert (verification.first.site, verification.first.tick) == ("m1", 400)
 
 
 @pytest.mark.parametrize(
@@ -132,15 +134,13 @@ def test_a_changed_hand_is_found(held: Log) -> None:
         ({"sites.m1.hands": [{"kind": "live", "mode": "foot"}]}, "must be one of"),
     ],
 )
-def test_a_live_hand_that_cannot_be_is_refused(
-    changes: dict[str, object], problem: str
-) -> None:
+def test_an_invalid_live_hand_is_refused(changes: dict[str, object], problem: str) -> None:
     with pytest.raises(ScenarioError, match=problem):
         load_scenario("paper", changes)
 
 
-def test_certificate_books_work_of_people_as_that_of_scripted_hands(held: Log) -> None:
-    """V changes by what its terms say, to 2e-5 of its largest value: `paper` itself closes to 1e-5."""
-    balance = compute_energy_balance(compute_site_energies(held))
+def test_certificates_book_peoples_work_like_scripts(held_log: Log) -> None:
+    """V changes by its booked terms, to 2e-5 of its largest value: `paper` itself closes to 1e-5."""
+    balance = compute_energy_balance(compute_site_energies(held_log))
     assert np.abs(balance.external_work).max() > 0.1
     assert np.abs(balance.residual).max() < 2e-5 * balance.V.max()

@@ -1,4 +1,6 @@
-"""Hands and plants of one's own in virtual time: what acts is recorded, and a log repeats it without them."""
+"""Users' own hands and plants in virtual time: their effect is recorded, and a log repeats that
+effect without their code.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -14,8 +16,8 @@ from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_scenario
 from trilat_net.log.log_reader import Log
+from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.imported_code import allowed_code
 from trilat_net.scenario.operators.program_hand import HandPlayer, find_own_hand
 from trilat_net.scenario.plant_player import make_plant_players
 
@@ -40,7 +42,7 @@ def kept_consents() -> Iterator[None]:
 
 
 def without_code(log: SimulatedLog) -> Log:
-    """The log as a stranger opens it, who lets nothing run."""
+    """Returns the log as opened by a stranger, who permits no code."""
     allowed_code.clear()
     return log
 
@@ -50,9 +52,7 @@ def without_code(log: SimulatedLog) -> Log:
     "keys", [{}, {"rate_hz": 100, "delay_ms": 0.0}, {"mode": "joint"}, {"delay_ms": 33.0}]
 )
 @pytest.mark.parametrize("name", ["paper", "free"])
-def test_compiled_run_pauses_where_a_hand_is_asked(
-    name: str, kind: str, keys: dict[str, Any]
-) -> None:
+def test_compiled_runs_pause_for_a_hand(name: str, kind: str, keys: dict[str, Any]) -> None:
     scenario = load_scenario(name, at_m2(kind, **keys))
     log, run = simulate_scenario(scenario), FusedRun(scenario, keep=2000)
     run.advance_to(scenario.duration_s)
@@ -150,9 +150,7 @@ def test_letting_go_is_no_failure() -> None:
         ),
     ],
 )
-def test_a_hand_that_cannot_be_is_refused(
-    keys: dict[str, Any], path: str, problem: str
-) -> None:
+def test_an_invalid_hand_is_refused(keys: dict[str, Any], path: str, problem: str) -> None:
     with pytest.raises(ScenarioError, match=problem) as refused:
         tn.simulate("paper", at_m2(**keys))
     assert refused.value.path.endswith(path)
@@ -170,7 +168,7 @@ def test_a_plant_is_measured_and_its_control_repeated() -> None:
         tn.simulate(log)
 
 
-def test_scenarios_arm_as_plant_differs_by_the_integrators_order() -> None:
+def test_own_plant_arm_differs_by_integrator_order() -> None:
     """Euler's steps against Runge-Kutta's: the difference halves with the period."""
 
     def apart(rate_hz: int) -> float:
@@ -196,7 +194,7 @@ def test_scenarios_arm_as_plant_differs_by_the_integrators_order() -> None:
         ("touch", "tau_x has 1 number"),
     ],
 )
-def test_a_plant_that_fails_ends_the_run_named(how: str, problem: str, tmp_path: Any) -> None:
+def test_failing_plants_are_named_and_end_runs(how: str, problem: str, tmp_path: Any) -> None:
     scenario = load_scenario("paper", with_plant("Torn", how=how))
     path = tmp_path / "torn.mcap"
     with pytest.raises(
@@ -233,7 +231,7 @@ def test_bodies_of_a_plant_are_in_every_record() -> None:
         ("short", "instead of seven"),
     ],
 )
-def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
+def test_infinite_bodies_end_the_run(how: str, problem: str) -> None:
     with pytest.raises(
         PlantFailed, match=f"Carousel of s failed at tick 99: ValueError: .*{problem}"
     ):
@@ -258,14 +256,14 @@ def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
         (3, "Carousel", r"the sizes of at most 32 bodies, as in \{ box"),
     ],
 )
-def test_bodies_that_cannot_be_are_refused(bodies: Any, kind: str, problem: str) -> None:
+def test_invalid_bodies_are_refused(bodies: Any, kind: str, problem: str) -> None:
     with pytest.raises(ScenarioError, match=problem) as refused:
         tn.simulate("paper", with_plant(kind, bodies=bodies))
     assert refused.value.path.startswith("sites.s.plant.bodies")
 
 
 @pytest.mark.parametrize("rate_hz", [1000, 400])
-def test_compiled_run_pauses_where_a_plant_moves(rate_hz: int) -> None:
+def test_compiled_runs_pause_for_a_plant(rate_hz: int) -> None:
     scenario = load_scenario(
         "paper", {**with_plant(), "duration_s": 1.0, "sites.s.rate_hz": rate_hz}
     )
@@ -280,13 +278,13 @@ def test_compiled_run_pauses_where_a_plant_moves(rate_hz: int) -> None:
             assert rows[:, columns[signal]].tobytes() == recorded.tobytes(), signal
 
 
-def test_a_sweep_takes_no_plant_and_says_so() -> None:
+def test_sweeps_refuse_a_plant() -> None:
     with pytest.raises(ScenarioError, match="is a user's own plant") as refused:
         FusedRun(load_scenario("paper", with_plant()))
     assert refused.value.path == "sites.s.plant"
 
 
-def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
+def test_scenario_text_holds_code_by_hash() -> None:
     scenario: Scenario = load_scenario(
         "paper", {**at_m2(settings={"turn_s": 2.5}), **with_plant()}
     )
@@ -296,7 +294,7 @@ def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
     assert again.sites["s"].plant == scenario.sites["s"].plant
 
 
-def test_a_person_takes_over_from_a_program_without_a_jump() -> None:
+def test_a_person_takes_over_without_a_jump() -> None:
     """Both lead a moving slave in turn; ramps step q_id by no more than 1.2 times the motion itself."""
     person = {
         "kind": "tip_spring",

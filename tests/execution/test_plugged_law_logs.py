@@ -1,4 +1,4 @@
-"""Logs of laws that look at each peer and send to it, executed again: whole, from any record, and changed."""
+"""Logs of laws with messages to each peer, executed again: whole, from any record, and changed."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def plugged(law: str) -> bytes:
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_a_plugged_law_is_verified_whole_and_behind_gaps(
+def test_plugged_laws_verify_whole_and_behind_gaps(
     law: str, session: dict[str, str] | None
 ) -> None:
     data = plugged(law)
@@ -39,7 +39,7 @@ def test_a_plugged_law_is_verified_whole_and_behind_gaps(
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
+def test_any_record_resumes_the_whole_run(law: str) -> None:
     log = opened(plugged(law))
     samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
     ends = dict.fromkeys(log.sites, TICKS - 1)
@@ -58,7 +58,7 @@ def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
                 ) == read_output(state, part.peers)
 
 
-def test_rerun_changes_what_changed_gain_changes_and_nothing_else() -> None:
+def test_a_changed_gain_changes_only_its_effect() -> None:
     log = opened(plugged("CompiledLine"))
     same = rerun(log, closed_loop=True)
     assert all(effect.identical == effect.executed == TICKS for effect in same.sites.values())

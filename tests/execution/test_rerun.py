@@ -1,4 +1,6 @@
-"""Sites of a log executed afresh: nothing changed gives the log; a change gives that experiment."""
+"""Sites of a log executed again: without changes the rerun equals the log; with a change, that
+experiment.
+"""
 
 from pathlib import Path
 
@@ -33,14 +35,14 @@ SHORT = {"duration_s": 0.12, "link.delay_ms": 20.0}
 @pytest.mark.parametrize(
     "scheme", ["second_order", pytest.param("digital", marks=pytest.mark.long)]
 )
-def test_nothing_changed_any_site_is_the_logs_bit_for_bit(name: str, scheme: str) -> None:
+def test_an_unchanged_rerun_equals_the_log_bitwise(name: str, scheme: str) -> None:
     log = opened(recorded(name, {"duration_s": 0.3, "scheme": scheme}))
     for site in log.sites:
         assert all_identical(rerun(log, [site]))
     assert all_identical(rerun(log, closed_loop=True))
 
 
-def test_sites_with_rates_of_their_own_are_the_logs_too() -> None:
+def test_reruns_of_different_rates_equal_the_log() -> None:
     rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
     log = opened(recorded("paper", {**rates, **SHORT}))
     for replace in (["m2"], ["m2", "s"], list(SITES)):
@@ -51,9 +53,7 @@ def test_sites_with_rates_of_their_own_are_the_logs_too() -> None:
 @pytest.mark.parametrize(
     "replace", [["m1"], ["m2"], ["s"], ["m2", "s"], ["m1", "m2", "s"]], ids=" ".join
 )
-def test_logs_of_every_version_with_changes_and_losses_rerun_equal(
-    path: Path, replace: list[str]
-) -> None:
+def test_reruns_of_every_log_version_are_equal(path: Path, replace: list[str]) -> None:
     again = rerun(path, replace)
     assert not again.request.changes
     assert not again.broken
@@ -71,14 +71,14 @@ def test_logs_of_every_version_with_changes_and_losses_rerun_equal(
 
 @settings(max_examples=15)
 @given(delays=under_way, lost=never, replace=site_sets)
-def test_samples_late_reordered_or_never_come_as_they_came(
+def test_recorded_delivery_is_repeated_exactly(
     delays: dict[Sample, int], lost: frozenset[Sample], replace: list[str]
 ) -> None:
     assert all_identical(rerun(opened(delivered(delays, lost)), replace))
 
 
-def test_change_of_one_site_is_its_step_with_recorded_samples() -> None:
-    """By hand: the site of the changed scenario, fed what its records list of its peers' records."""
+def test_a_changed_site_sees_recorded_samples() -> None:
+    """By hand: the site of the changed scenario receives the samples that its records list."""
     log = opened(
         delivered({("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)})
     )
@@ -91,8 +91,10 @@ def test_change_of_one_site_is_its_step_with_recorded_samples() -> None:
     site = Site(load_scenario(log.scenario, changes).setup("s"))
     samples = [{state.tick: state for state in log[peer].states} for peer in site.peers]
     for state, made in zip(log["s"].states, again.after["s"].states, strict=True):
-        came = [Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx]
-        assert equal_record(made, site.step(TickInput(state.tick, came)), site.peers)
+        arrivals = [
+            Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx
+        ]
+        assert equal_record(made, site.step(TickInput(state.tick, arrivals)), site.peers)
     assert again.sites["s"].first is not None
     assert not again.identical
     assert not again.broken
@@ -121,10 +123,10 @@ def test_change_of_one_site_is_its_step_with_recorded_samples() -> None:
     ],
     ids=lambda changes: " ".join(changes),
 )
-def test_a_change_in_a_closed_loop_is_the_changed_experiment(
+def test_closed_loop_changes_equal_the_changed_experiment(
     changes: dict[str, object],
 ) -> None:
-    """Where every sample comes long before it is due, the network does not matter (L2)."""
+    """If every sample comes long before it is due, the network does not matter (L2)."""
     again = rerun(opened(recorded("free")), [], changes, closed_loop=True)
     twin = simulated("free", {**SHORT, **changes})
     for site in SITES:
@@ -134,14 +136,14 @@ def test_a_change_in_a_closed_loop_is_the_changed_experiment(
         assert len(ours) >= len(theirs) - 2
 
 
-def test_in_closed_loops_longer_delays_make_late_samples_harmless() -> None:
+def test_longer_delays_make_late_samples_harmless() -> None:
     log = opened(delivered({("m2", 1, 40): 25, ("s", 0, 50): 31, ("s", 1, 51): 30}))
     again = rerun(log, [], {"link.delay_ms": 31.0}, closed_loop=True)
     twin = simulated("free", {"duration_s": 0.12, "link.delay_ms": 31.0})
     assert all(motion(again.after, site) == motion(twin, site) for site in SITES)
 
 
-def test_on_a_measured_link_arrivals_are_all_that_counts() -> None:
+def test_on_measured_links_only_arrivals_count() -> None:
     log = opened(delivered({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
     again = rerun(log, ["s"], {"link.model": "measured"})
     assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == (
@@ -150,8 +152,8 @@ def test_on_a_measured_link_arrivals_are_all_that_counts() -> None:
     )
 
 
-def test_recorded_sites_do_not_react_and_executed_ones_do() -> None:
-    """An m1 that moves otherwise is seen by s where s is executed, 20 ms later, and by nobody else."""
+def test_only_executed_sites_react() -> None:
+    """If m1 moves otherwise, an executed s sees the change 20 ms later, and no other site does."""
     log = opened(recorded("free"))
     stiff = {"sites.m1.control.Kd": 9.0}
     alone, both = rerun(log, ["m1"], stiff), rerun(log, ["m1", "s"], stiff)
@@ -163,7 +165,7 @@ def test_recorded_sites_do_not_react_and_executed_ones_do() -> None:
     assert motion(alone.after, "m1")[60:] != motion(both.after, "m1")[60:]
 
 
-def test_a_site_that_diverges_stops_there_and_says_so() -> None:
+def test_a_diverging_site_stops_and_is_reported() -> None:
     log = opened(recorded("free"))
     again = rerun(log, ["s", "m1"], {"sites.s.limits.qd_limit_rad_s": 0.3})
     effect = again.sites["s"]
@@ -176,7 +178,7 @@ def test_a_site_that_diverges_stops_there_and_says_so() -> None:
     assert len(again.after["m2"]) == TICKS
 
 
-def test_a_log_that_diverged_is_executed_to_its_end() -> None:
+def test_diverged_logs_are_executed_to_their_end() -> None:
     log = opened(recorded("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3}))
     for replace in (["m1"], list(SITES)):
         again = rerun(log, replace)
@@ -204,7 +206,7 @@ def test_a_log_that_diverged_is_executed_to_its_end() -> None:
         "too many",
     ],
 )
-def test_strange_arrivals_end_nothing(change: object) -> None:
+def test_unusual_arrivals_end_nothing(change: object) -> None:
     def record(r: dict[str, object]) -> dict[str, object]:
         if r["site"] == "s" and r["tick"] in (50, 51):
             change(r)
@@ -216,7 +218,7 @@ def test_strange_arrivals_end_nothing(change: object) -> None:
             assert rerun(log, replace, changes).sites["s"].executed >= 60
 
 
-def test_facts_are_plain_and_name_their_units() -> None:
+def test_facts_are_plain_with_units() -> None:
     facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).to_dict()
     assert facts["mode"] == "open loop"
     assert facts["changes"] == [
@@ -228,7 +230,7 @@ def test_facts_are_plain_and_name_their_units() -> None:
     assert site["first"]["field"] == "tau[0]"
 
 
-def test_it_can_be_asked_of_the_package(tmp_path: Path) -> None:
+def test_the_package_offers_reruns(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(recorded("paper"))
     again = trilat_net.rerun(path, replace="s", set={"control.Kd": 5})

@@ -1,4 +1,4 @@
-"""What a log does not know: what is executed all the same, what stands, and what is said of it."""
+"""Reruns over missing records: the executed ticks, the copied records, and the message."""
 
 import pytest
 from hypothesis import given, settings
@@ -23,7 +23,7 @@ from .logs import all_identical, motion, without_records
 
 @settings(max_examples=15)
 @given(lost=gaps(25), replace=site_sets, delays=under_way)
-def test_behind_a_gap_a_rerun_is_the_log_again(
+def test_reruns_continue_behind_a_gap(
     lost: dict[str, set[int]], replace: list[str], delays: dict[Sample, int]
 ) -> None:
     log = without_records(lost, delivered(first_in_first_out(delays)))
@@ -41,10 +41,10 @@ def test_behind_a_gap_a_rerun_is_the_log_again(
     lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50),
     data=st.data(),
 )
-def test_changed_site_goes_through_gaps_as_if_there_were_none(
+def test_changed_sites_pass_through_gaps(
     replace: list[str], lost: set[int], data: st.DataObject
 ) -> None:
-    """Samples that came where no record is are inferred; as long as none was late, rightly."""
+    """Arrivals without record are inferred, correctly as long as no sample was late."""
     gapped = data.draw(st.sampled_from(replace))
     changes = {"control.Kd": 5.0}
     whole = rerun(opened(recorded("free")), replace, changes)
@@ -58,7 +58,7 @@ def test_changed_site_goes_through_gaps_as_if_there_were_none(
 @pytest.mark.parametrize(
     "changes", [{}, {"control.Kd": 5.0}], ids=["nothing changed", "changed"]
 )
-def test_a_log_that_begins_late_is_executed_where_possible(changes: dict[str, float]) -> None:
+def test_late_logs_are_executed_where_possible(changes: dict[str, float]) -> None:
     """Every recorder began at tick 40: with samples 20 ms old, from tick 61 on all in use are known."""
     log = without_records({site: range(40) for site in SITES}, recorded("free"))
     again = rerun(log, ["s"], changes)
@@ -74,27 +74,27 @@ def test_a_log_that_begins_late_is_executed_where_possible(changes: dict[str, fl
         assert effect.first.tick == first  # the gain acts from there
 
 
-def test_sample_that_came_and_is_not_in_log_is_told() -> None:
+def test_arrivals_missing_in_the_log_are_reported() -> None:
     again = rerun(without_records({"m1": range(30, 35)}), ["s"], {"control.Kd": 5.0})
     assert again.sites["s"].lacking == 5
     assert any("5 samples that arrived are not in the log" in note for note in again.notes)
 
 
-def test_too_few_records_are_refused_where_something_is_changed() -> None:
+def test_too_few_records_refuse_a_changed_rerun() -> None:
     log = without_records({"s": range(10, 110)})
     with pytest.raises(LogError, match="20 of 120 ticks: too few"):
         rerun(log, ["s"], {"control.Kd": 5.0})
     assert rerun(log, ["s"]).identical
 
 
-def test_a_log_that_begins_late_keeps_its_rates() -> None:
+def test_late_logs_keep_their_rates() -> None:
     log = without_records({site: range(40) for site in SITES})
     with pytest.raises(LogError, match="begin at tick 40"):
         rerun(log, [], {"rate_hz": 500}, closed_loop=True)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6])
-def test_a_torn_log_is_executed_as_far_as_it_goes(share: float) -> None:
+def test_torn_logs_are_executed_until_their_tear(share: float) -> None:
     data = edited(recorded("paper"), chunk_bytes=2048)
     log = opened(data[: int(share * len(data))])
     again = rerun(log, ["s"])

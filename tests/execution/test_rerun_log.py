@@ -1,4 +1,4 @@
-"""A rerun as a log: sound, executed again, and honest about where it comes from."""
+"""The log of a rerun is sound, can be executed again, and names its source."""
 
 import hashlib
 import io
@@ -28,7 +28,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_file_says_where_it_comes_from_and_what_is_otherwise(file: Path) -> None:
+def test_rerun_logs_name_source_and_differences(file: Path) -> None:
     after = rerun(file, ["s"], {"control.Kd": 5}).after
     session = after.session
     assert after.driver == "rerun"
@@ -46,7 +46,7 @@ def test_file_says_where_it_comes_from_and_what_is_otherwise(file: Path) -> None
 @pytest.mark.parametrize(
     "changes", [{}, {"control.Kd": 5, "link.delay_ms": 12.0}], ids=["same", "changed"]
 )
-def test_recorded_sites_stand_byte_for_byte(changes: dict[str, float]) -> None:
+def test_recorded_sites_stay_byte_for_byte(changes: dict[str, float]) -> None:
     log = opened(recorded("free"))
     after = rerun(log, ["s"], changes).after
     # it is in memory
@@ -65,7 +65,7 @@ def test_recorded_sites_stand_byte_for_byte(changes: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize("replace", [["s"], ["m1", "s"], list(SITES)], ids=" ".join)
-def test_what_was_executed_is_verified_and_what_stands_is_not(replace: list[str]) -> None:
+def test_only_executed_sites_are_verified(replace: list[str]) -> None:
     after = rerun(opened(recorded("free")), replace, {"control.Kd": 5}).after
     verdict = verify(after)
     assert after.executed_sites == tuple(sorted(replace))
@@ -88,14 +88,14 @@ def test_a_closed_loop_is_virtual_time_again() -> None:
         assert (twin.identical, twin.first) == (3 * TICKS, None)
 
 
-def test_records_that_stand_are_not_judged() -> None:
+def test_copied_records_are_not_judged() -> None:
     log = without_records({"s": [40, 41, 70], "m1": [40, 41, 42]})
     verdict = verify(rerun(log, ["s"]).after)
     assert verdict.agreed, str(verdict.first)
     assert [gap[1:] for gap in verdict.gaps] == [(40, 41), (70, 70)]
 
 
-def test_an_older_log_becomes_one_of_this_version() -> None:
+def test_older_logs_become_this_version() -> None:
     again = rerun(GOLDEN, ["m2"])
     for name in again.before.sites:
         for ours, theirs in zip(
@@ -113,20 +113,20 @@ def test_an_older_log_becomes_one_of_this_version() -> None:
     assert {event.n for event in again.after.events if event.member == "s"} == set(range(4))
 
 
-def test_rerun_can_be_rerun_and_says_what_it_cannot_be(file: Path, tmp_path: Path) -> None:
-    made = tmp_path / "again.mcap"
-    rerun(file, ["s"], {"control.Kd": 5}).save(made)
-    again = rerun(made, ["s"])
+def test_reruns_can_be_rerun_within_limits(file: Path, tmp_path: Path) -> None:
+    log_path = tmp_path / "again.mcap"
+    rerun(file, ["s"], {"control.Kd": 5}).save(log_path)
+    again = rerun(log_path, ["s"])
     assert again.identical
-    other = rerun(made, ["m1"])  # met the s that was, and meets the one that is in the file
+    other = rerun(log_path, ["m1"])  # met the s that was, and meets the one that is in the file
     assert not other.identical
     assert not other.broken
     assert any("is itself a rerun" in note and "m1" in note for note in other.notes)
-    back = rerun(made, ["s"], {"control.Kd": 3})
+    back = rerun(log_path, ["s"], {"control.Kd": 3})
     assert list(back.after["s"].q[-1]) == list(open_log(file)["s"].q[-1])
 
 
-def test_a_file_that_exists_is_kept(file: Path) -> None:
+def test_an_existing_file_is_kept(file: Path) -> None:
     before = file.read_bytes()
     again = rerun(file, ["s"])
     with pytest.raises(UsageError, match="exists"):

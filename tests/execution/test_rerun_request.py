@@ -1,4 +1,4 @@
-"""What may be asked of a log, and what is refused, with the reason."""
+"""Requests for reruns: valid changes, and refusals with their reason."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,7 +18,7 @@ from .deliveries import SITES
 Overrides = Mapping[str, Any] | Sequence[str]
 
 
-def asked(
+def request_rerun(
     replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False
 ) -> RerunRequest:
     return resolve_rerun_request(
@@ -26,13 +26,17 @@ def asked(
     )
 
 
-def test_nothing_changed_is_the_experiment_of_the_log() -> None:
+def test_an_unchanged_request_is_the_logs_experiment() -> None:
     for name in ("paper", "handover", "outage"):
         log = opened(recorded(name, {"duration_s": 0.3}))
         for replace in (log.sites[:1], log.sites):
-            found = resolve_rerun_request(log, replace, (), closed_loop=False)
-            assert found.scenario == log.scenario
-            assert (found.changes, found.without_effect, describe_rerun_changes(found)) == (
+            request = resolve_rerun_request(log, replace, (), closed_loop=False)
+            assert request.scenario == log.scenario
+            assert (
+                request.changes,
+                request.without_effect,
+                describe_rerun_changes(request),
+            ) == (
                 [],
                 [],
                 [],
@@ -40,7 +44,7 @@ def test_nothing_changed_is_the_experiment_of_the_log() -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
+    ("overrides", "arguments"),
     [
         (["control.Kd=5"], ["control.Kd of s: 3 -> 5"]),
         (["sites.s.control.Kd=[5,6]"], ["control.Kd of s: 3 -> [5, 6]"]),
@@ -63,43 +67,47 @@ def test_nothing_changed_is_the_experiment_of_the_log() -> None:
     ],
     ids=str,
 )
-def test_differences_are_told_in_lines_of_the_executed_scenario(
-    overrides: list[str], words: list[str]
+def test_differences_are_lines_of_the_executed_scenario(
+    overrides: list[str], arguments: list[str]
 ) -> None:
-    assert describe_rerun_changes(asked(["s"], overrides)) == words
+    assert describe_rerun_changes(request_rerun(["s"], overrides)) == arguments
 
 
-def test_what_stands_as_recorded_keeps_its_own() -> None:
-    found = asked(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
+def test_copied_sites_keep_their_settings() -> None:
+    request = request_rerun(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
     original = opened(recorded("paper")).scenario
     for name in ("m1", "m2"):
-        assert found.scenario.sites[name] == original.sites[name]
-        assert found.scenario.links[f"s->{name}"] == original.links[f"s->{name}"]
-    assert found.scenario.sites["s"].arm.m2_kg == 2.0
-    assert {changed.key for changed in found.without_effect} >= {
+        assert request.scenario.sites[name] == original.sites[name]
+        assert request.scenario.links[f"s->{name}"] == original.links[f"s->{name}"]
+    assert request.scenario.sites["s"].arm.m2_kg == 2.0
+    assert {changed.key for changed in request.without_effect} >= {
         "sites.m1.control.Kd",
         "links.s->m2.delay_ms",
     }
 
 
-def test_a_timeline_is_each_sites_own() -> None:
+def test_each_site_has_its_own_timeline() -> None:
     timeline = [
         {"at_s": 0.01, "link": "m1->s", "to": {"delay_ms": 5.0}},
         {"at_s": 0.02, "link": "s->m1", "to": {"delay_ms": 6.0}},
         {"at_s": 0.03, "dominance": "s", "to": {"m1": 1.0}},
     ]
-    found = asked(["s"], {"timeline": timeline})
-    assert [(change.link, change.dominance) for change in found.scenario.timeline] == [
+    request = request_rerun(["s"], {"timeline": timeline})
+    assert [(change.link, change.dominance) for change in request.scenario.timeline] == [
         ("m1->s", ""),
         ("", "s"),
     ]
-    assert len(asked([], {"timeline": timeline}, closed_loop=True).scenario.timeline) == 3
+    assert (
+        len(request_rerun([], {"timeline": timeline}, closed_loop=True).scenario.timeline) == 3
+    )
 
 
-def test_every_site_is_a_closed_loop() -> None:
-    assert asked(SITES).mode == asked([], closed_loop=True).mode == "closed loop"
-    assert asked(["s", "m1", "s"]).replaced == ("m1", "s")
-    assert asked(["s", "m1"]).mode == "open loop"
+def test_all_sites_make_a_closed_loop() -> None:
+    assert (
+        request_rerun(SITES).mode == request_rerun([], closed_loop=True).mode == "closed loop"
+    )
+    assert request_rerun(["s", "m1", "s"]).replaced == ("m1", "s")
+    assert request_rerun(["s", "m1"]).mode == "open loop"
 
 
 @pytest.mark.parametrize(
@@ -109,11 +117,11 @@ def test_every_site_is_a_closed_loop() -> None:
         (["s"], True, ["replace", "closed_loop=True"]),
     ],
 )
-def test_it_must_be_said_which_sites_once(
+def test_sites_must_be_named_once(
     replace: list[str], closed_loop: bool, facts: list[str]
 ) -> None:
     with pytest.raises(UsageError) as caught:
-        asked(replace, closed_loop=closed_loop)
+        request_rerun(replace, closed_loop=closed_loop)
     assert all(fact in str(caught.value) for fact in facts)
 
 
@@ -134,20 +142,20 @@ def test_it_must_be_said_which_sites_once(
     ],
     ids=str,
 )
-def test_what_cannot_be_otherwise_is_refused_with_the_reason(
-    overrides: list[str], facts: list[str]
-) -> None:
+def test_fixed_settings_are_refused_with_reason(overrides: list[str], facts: list[str]) -> None:
     with pytest.raises(ScenarioError) as caught:
-        asked(["s"], overrides)
+        request_rerun(["s"], overrides)
     assert all(fact in str(caught.value) for fact in facts), caught.value
 
 
 def test_an_unknown_site_is_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="no site 'm3'; did you mean 'm"):
-        asked(["m3"])
+        request_rerun(["m3"])
 
 
 @pytest.mark.parametrize("other", [{"x": {"role": "slave"}}, {"s": {"rate_hz": 5}}])
-def test_a_whole_table_cannot_bring_other_sites_or_rates_in(other: dict[str, Any]) -> None:
+def test_whole_tables_cannot_change_sites_or_rates(other: dict[str, Any]) -> None:
     with pytest.raises(ScenarioError):
-        asked(["s"], {"sites": {"m1": {"role": "slave"}, "m2": {"role": "slave"}, **other}})
+        request_rerun(
+            ["s"], {"sites": {"m1": {"role": "slave"}, "m2": {"role": "slave"}, **other}}
+        )

@@ -21,7 +21,7 @@ def log() -> Log:
     return trilat_net.simulate("unlike_arms", SHORT)
 
 
-def test_its_records_are_those_of_the_fused_run(log: Log) -> None:
+def test_task_records_equal_the_fused_runs(log: Log) -> None:
     """Places, velocities and wrenches of arms of two and of seven joints."""
     run = FusedRun(load_scenario("unlike_arms", SHORT))
     run.advance_to(1.0)
@@ -31,7 +31,7 @@ def test_its_records_are_those_of_the_fused_run(log: Log) -> None:
         assert record[: len(row)].tolist() == row.tolist()
 
 
-def test_its_error_is_that_of_the_place(log: Log) -> None:
+def test_task_errors_are_those_of_place(log: Log) -> None:
     for part in (log[name] for name in log.sites):
         assert part.e.shape[1] == 3
         followed = [0, 2] if part.name != "s" else [0, 1, 2]
@@ -49,12 +49,12 @@ def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
         )
         assert not own["rms_error_rad"].applies
         assert own["unaccounted_j"].value < 1e-6
-    apart = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
-    assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= apart
+    distance = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
+    assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= distance
     assert {"tracking_errors", "settling", "phase"} <= set(list_drawable_figures(log))
 
 
-def test_the_end_of_a_run_is_told_in_metres(log: Log) -> None:
+def test_a_runs_end_is_in_metres(log: Log) -> None:
     assert classify_log_end(log).error_unit == "m"
 
 
@@ -72,7 +72,7 @@ damping_n_s_m = 20
 """
 
 
-def test_wall_is_felt_at_end_effector_as_shares_say() -> None:
+def test_wall_forces_follow_the_shares() -> None:
     """P+d holds e by K along each axis, so that the wrenches of two sites that rest cancel."""
     text = planar_task(8.0)
     head, rest = text.split("[control]")
@@ -81,7 +81,9 @@ def test_wall_is_felt_at_end_effector_as_shares_say() -> None:
         parse_scenario(text.replace("[dominance]", TOUCH + "[dominance]"))
     )
     metrics = compute_log_metrics(log)
-    pair = next(one for one in metrics.sharing_ratios if one.by_wall)
+    pair = next(
+        sharing_ratio for sharing_ratio in metrics.sharing_ratios if sharing_ratio.by_wall
+    )
     assert (metrics.label(pair.joint), metrics.unit("N m", pair.joint)) == ("x", "N")
     assert pair.expected_nm.value is not None
     assert pair.felt_nm == pytest.approx(pair.expected_nm.value, rel=1e-3)
@@ -89,6 +91,6 @@ def test_wall_is_felt_at_end_effector_as_shares_say() -> None:
     assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(
         -pair.pushed_nm, rel=1e-2
     )
-    entry = next(one for one in metrics.to_dict()["force_sharing"] if one["axis"] == "x")
+    entry = next(ratio for ratio in metrics.to_dict()["force_sharing"] if ratio["axis"] == "x")
     assert entry["felt_n"] == pair.felt_nm
     assert "felt_nm" not in entry

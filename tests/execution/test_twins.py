@@ -1,4 +1,4 @@
-"""A twin is the run, and differs from it by what became of its push alone."""
+"""A twin equals the run, except for the effect of its push."""
 
 import math
 from pathlib import Path
@@ -35,7 +35,7 @@ def rate_per_s(scenario: Scenario, twins: Twins) -> float:
 
 
 @pytest.mark.parametrize(("d", "seconds"), [(0.5, 40.0), (2.0, 40.0), (3.0, 40.0)])
-def test_the_difference_of_a_linear_loop_obeys_its_root(d: float, seconds: float) -> None:
+def test_linear_differences_obey_their_root(d: float, seconds: float) -> None:
     scenario = at_rest(d)
     twins = run_virtual_twins(scenario, [parse_push(scenario, "m1.q1", 1e-7)], seconds)
     roots = tn.linear("p_d_margin", {"control.d": d}, pose=(0.3, 0.5), ports=False).to_dict()
@@ -43,7 +43,7 @@ def test_the_difference_of_a_linear_loop_obeys_its_root(d: float, seconds: float
     assert rate_per_s(scenario, twins) == pytest.approx(root_per_s, rel=0.02)
 
 
-def test_a_push_of_nothing_changes_no_bit() -> None:
+def test_a_zero_push_changes_no_bit() -> None:
     scenario = load_scenario("paper")
     by = np.zeros((3, 2))
     twins = run_virtual_twins(
@@ -55,14 +55,14 @@ def test_a_push_of_nothing_changes_no_bit() -> None:
 
 @pytest.mark.parametrize("name", ["live-4g", "live-paper"])
 def test_a_live_run_is_repeated_bit_for_bit(name: str) -> None:
-    """With the arrivals that it had: late ones, lost ones, and those before their time."""
+    """With its recorded arrivals: late samples, lost samples, and early samples."""
     log = tn.open_log(GOLDEN / f"{name}.mcap")
     twins = run_twins(log, choose_pushes(log.scenario, 1))
     assert twins.same
     assert np.isfinite(twins.paths[0].largest[1:-1]).all()
 
 
-def test_a_push_in_one_closed_group_never_reaches_the_other() -> None:
+def test_pushes_never_reach_other_closed_groups() -> None:
     scenario = two_pairs((p_d(2.0), p_d(2.0)), (0.1, 0.3, 0.2, 0.6))
     twins = run_virtual_twins(scenario, [parse_push(scenario, "a.q1")], 4.0)
     reached = np.isfinite(twins.paths[0].largest).any(axis=0)
@@ -70,7 +70,7 @@ def test_a_push_in_one_closed_group_never_reaches_the_other() -> None:
 
 
 @pytest.mark.long
-def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
+def test_rescaling_a_difference_keeps_its_rate() -> None:
     scenario = at_rest(0.5)
     free = parse_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
     often = free._replace(largest=2e-9)
@@ -81,7 +81,7 @@ def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
     assert first == pytest.approx(second, abs=1e-3)
 
 
-def test_what_dies_down_ends_there_or_is_pushed_anew() -> None:
+def test_dying_differences_end_or_are_repeated() -> None:
     scenario = at_rest(3.0)
     once = parse_push(scenario, "m1.qd2", 1e-9)
     twins = run_virtual_twins(scenario, [once, once._replace(again=True)], 60.0)
@@ -93,19 +93,19 @@ def test_what_dies_down_ends_there_or_is_pushed_anew() -> None:
     assert len(anew.pushed) > 1
 
 
-def test_a_twin_that_leaves_its_limits_is_told() -> None:
-    """The run itself stays within them; a twin that was pushed far enough does not."""
+def test_a_twin_beyond_its_limits_is_reported() -> None:
+    """The run itself stays within the limits; a twin with a large enough push does not."""
     log = tn.simulate("paper", {"limits.qd_limit_rad_s": 1.2}, duration_s=10)
-    found = tn.twin(log, 1, {"m1.q1": 0.9, "q": 1e-3})
-    far, near = found.growth.pushes
+    twin_report = tn.twin(log, 1, {"m1.q1": 0.9, "q": 1e-3})
+    far, near = twin_report.growth.pushes
     assert log.diverged_s is None
     assert far.ended_s is not None
     assert 1.0 < far.ended_s < 2.0
-    assert "makes the run diverge in " in found.describe(far)
+    assert "makes the run diverge in " in twin_report.describe(far)
     assert near.ended_s is None
 
 
-def test_a_push_is_at_its_instant() -> None:
+def test_a_push_acts_at_its_instant() -> None:
     scenario = load_scenario("two_sites")
     twins = run_virtual_twins(scenario, [parse_push(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)
     path = twins.paths[0]
@@ -134,7 +134,7 @@ def test_a_push_is_at_its_instant() -> None:
         ("theta", "1e-06 of all estimates", [(i, j) for i in range(3) for j in range(5)]),
     ],
 )
-def test_a_push_is_aimed_by_words(
+def test_a_push_is_named_by_words(
     target: str, name: str, pushed: list[tuple[int, int]]
 ) -> None:
     push = parse_push(load_scenario("paper"), target)
@@ -146,12 +146,12 @@ def test_a_push_is_aimed_by_words(
 @pytest.mark.parametrize(
     "target", ["", "m1", "m1.q0", "m1.q3", "m1.theta6", "m4.q1", "q1", "m1.q1.q1", "m1.tau1"]
 )
-def test_what_cannot_be_pushed_is_refused_with_what_can(target: str) -> None:
+def test_impossible_pushes_name_the_possible_ones(target: str) -> None:
     with pytest.raises(UsageError, match=r"no such number; .* m1 \(2 joints, 5 estimates\)"):
         parse_push(load_scenario("paper"), target)
 
 
 @pytest.mark.parametrize("size", [0.0, math.nan, math.inf, 1e-12, -2.0])
-def test_a_size_that_is_none_is_refused(size: float) -> None:
+def test_an_invalid_size_is_refused(size: float) -> None:
     with pytest.raises(UsageError, match="from 1e-11 to 1"):
         parse_push(load_scenario("paper"), "m1.q1", size)

@@ -15,20 +15,20 @@ from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.own_code.code_consent import find_user_laws
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.code_consent import find_user_laws
 from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 
 LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
-def own(law: str = LAW, **more: Any) -> bytes:
+def record_own_law(law: str = LAW, **more: Any) -> bytes:
     return recorded("paper", {**SHORT, "control.law": law, **more})
 
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric"])
-def test_a_law_that_repeats_the_papers_gives_its_bits(name: str) -> None:
+def test_own_paper_law_gives_equal_bits(name: str) -> None:
     """Gains of the shipped scenarios are those of `tests.laws`."""
     ours = opened(recorded(name, SHORT))
     theirs = opened(recorded(name, {**SHORT, "control.law": LAW}))
@@ -44,9 +44,9 @@ def test_a_law_that_repeats_the_papers_gives_its_bits(name: str) -> None:
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_behind_a_gap_it_goes_on_from_its_memory(session: dict[str, str] | None) -> None:
-    """As much can be judged as of a law of ours."""
-    verdict = verify(without_records({"s": range(50, 61)}, own(), session))
+def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> None:
+    """As much can be judged as of a shipped law."""
+    verdict = verify(without_records({"s": range(50, 61)}, record_own_law(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
     ours = verify(without_records({"s": range(50, 61)}, recorded("paper", SHORT), session))
@@ -55,9 +55,9 @@ def test_behind_a_gap_it_goes_on_from_its_memory(session: dict[str, str] | None)
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_a_memory_that_does_not_say_all_is_found_out(session: dict[str, str] | None) -> None:
-    """Where nothing has to be recalled it passes; behind a gap, or tick by tick, it does not."""
-    data = own("tests.laws:Forgetful")
+def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
+    """If no memory has to be restored the law passes; behind a gap, or tick by tick, it does not."""
+    data = record_own_law("tests.laws:Forgetful")
     assert verify(opened(data)).passed
     verdict = verify(without_records({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
@@ -65,8 +65,8 @@ def test_a_memory_that_does_not_say_all_is_found_out(session: dict[str, str] | N
 
 
 @pytest.mark.parametrize("law", [LAW, "adaptive"])
-def test_started_afresh_from_its_records_a_site_is_the_same(law: str) -> None:
-    """Also after changes that were ordered while it ran, over a link whose delay varies."""
+def test_restarted_sites_are_the_same(law: str) -> None:
+    """Also after changes that were ordered while the run lasted, over a link whose delay varies."""
     link = {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}
     scenario = load_scenario("paper", {"duration_s": 0.3, "control.law": law, "link": link})
     orders = [
@@ -85,38 +85,46 @@ def test_started_afresh_from_its_records_a_site_is_the_same(law: str) -> None:
     assert verdict.identical == verdict.records == 900
 
 
-def test_hidden_memory_of_a_law_shows_at_a_fresh_start() -> None:
-    log = opened(own("tests.laws:Forgetful"))
+def test_hidden_memory_shows_at_a_restart() -> None:
+    log = opened(record_own_law("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
-    found = verify(log, resume_every=40)
-    assert found.first is not None
-    assert found.first.tick == 40
+    verification = verify(log, resume_every=40)
+    assert verification.first is not None
+    assert verification.first.tick == 40
 
 
-def test_the_report_says_how_hidden_memory_would_show() -> None:
-    log = opened(own("tests.laws:Forgetful"))
+def test_reports_explain_hidden_memory() -> None:
+    log = opened(record_own_law("tests.laws:Forgetful"))
     (law,) = find_user_laws(log.scenario)[:1]
 
     def find_text(**settings: int) -> str:
         findings = run_log_checks(log, virtual=False, **settings).findings
-        return next(one.text for one in findings if one.check == "executed again")
+        return next(finding.text for finding in findings if finding.check == "executed again")
 
-    words = ["trilat", "verify", *log.sources, "--law", str(law.file), "--resume-every", "100"]
-    command = join_arguments(words)
+    verify_command = [
+        "trilat",
+        "verify",
+        *log.sources,
+        "--law",
+        str(law.file),
+        "--resume-every",
+        "100",
+    ]
+    command = join_arguments(verify_command)
     assert find_text().endswith(f"but by: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
     built_in = run_log_checks(opened(recorded("paper")), virtual=False)
-    assert not [one for one in built_in.findings if "--resume-every" in one.text]
+    assert not [finding for finding in built_in.findings if "--resume-every" in finding.text]
 
 
-def test_a_changed_memory_shows_at_its_own_tick() -> None:
+def test_changed_memory_shows_at_its_tick() -> None:
     def record(r: Record) -> Record:
         if (r["site"], r["tick"]) == ("m2", 70):
             r["mem"][4] += 1e-3
         return r
 
-    verdict = verify(opened(edited(own(), record=record)))
+    verdict = verify(opened(edited(record_own_law(), record=record)))
     assert verdict.differing == 1
     assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
 
@@ -125,7 +133,7 @@ def test_a_changed_memory_shows_at_its_own_tick() -> None:
 def file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> Path:
-    """A law in a file of the folder that the person is in; its module is this test's own."""
+    """Writes a law into the current folder, as a module of this test alone."""
     monkeypatch.chdir(tmp_path)
     name = "".join(letter for letter in request.node.name if letter.isalnum())
     file = tmp_path / f"law_{name}.py"
@@ -143,7 +151,7 @@ def log_of(file: Path) -> io.BytesIO:
     return stream
 
 
-def test_changed_file_is_judged_if_one_asks_for_that_version(file: Path) -> None:
+def test_changed_files_are_judged_on_request(file: Path) -> None:
     stream = log_of(file)
     log = open_log(stream)
     (law,) = find_user_laws(log.scenario)
@@ -172,7 +180,7 @@ def reopened(stream: io.BytesIO, **how: Any) -> Log:
     return open_log(stream, **how)
 
 
-def test_a_file_that_is_not_there_says_what_to_do(file: Path) -> None:
+def test_a_missing_file_names_the_remedy(file: Path) -> None:
     log = open_log(log_of(file))
     file.unlink()
     (law,) = find_user_laws(log.scenario)
@@ -205,7 +213,7 @@ FAILURES = {
 
 @pytest.mark.parametrize("how", FAILURES)
 @pytest.mark.parametrize("at", [0, 30])
-def test_a_failing_law_ends_the_run_with_a_finished_log(how: str, at: int) -> None:
+def test_failing_laws_leave_a_finished_log(how: str, at: int) -> None:
     law = {"law": "tests.laws:Failing", "how": how, "at": at}
     stream = io.BytesIO()
     with pytest.raises(LawFailed) as caught:
@@ -230,7 +238,7 @@ def test_a_failing_law_ends_the_run_with_a_finished_log(how: str, at: int) -> No
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_the_record_of_an_arm_outside_is_its_input(session: dict[str, str] | None) -> None:
+def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
     log = opened(edited(external_log(), session=session))
     assert log["s"].q[50].tolist() == [0.5, -0.3]
     verdict = verify(log)
@@ -241,15 +249,15 @@ def test_the_record_of_an_arm_outside_is_its_input(session: dict[str, str] | Non
     assert twins.plain.records == 0
 
 
-def test_an_arm_outside_is_executed_behind_a_gap_too() -> None:
-    """As much can be judged as of an arm of ours."""
+def test_external_arms_are_executed_behind_gaps() -> None:
+    """As much can be judged as of a simulated arm."""
     verdict = verify(without_records({"s": range(40, 45)}, external_log()))
     assert verdict.agreed
     ours = verify(without_records({"s": range(40, 45)}, recorded("two_sites", SHORT)))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
 
 
-def test_another_measurement_in_the_record_is_another_torque() -> None:
+def test_another_measurement_gives_another_torque() -> None:
     def record(r: Record) -> Record:
         if (r["site"], r["tick"]) == ("s", 70):
             r["q"][1] += 1e-6
@@ -260,7 +268,7 @@ def test_another_measurement_in_the_record_is_another_torque() -> None:
     assert verdict.first.field.startswith("tau")
 
 
-def test_virtual_time_has_no_arm_outside() -> None:
+def test_virtual_time_has_no_external_arm() -> None:
     scenario = load_scenario("two_sites", {"sites.s.plant": "external"})
     with pytest.raises(ScenarioError, match="can only run live"):
         virtual.write_virtual_log(scenario, io.BytesIO())

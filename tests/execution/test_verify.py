@@ -63,13 +63,13 @@ def test_every_record_of_an_untouched_log_is_identical(name: str, scheme: str) -
     assert (verdict.unjudged, verdict.differing, verdict.gaps) == (0, 0, [])
 
 
-def test_sites_with_rates_of_their_own_are_identical_too() -> None:
+def test_different_rates_are_identical() -> None:
     rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
     log = opened(recorded("paper", {**rates, "duration_s": 0.5}))
     assert verify(log).identical == 500 + 350 + 166
 
 
-def test_a_diverged_run_is_identical_to_its_last_record() -> None:
+def test_diverged_runs_are_identical_to_their_end() -> None:
     data = recorded("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3})
     log = opened(data)
     assert log["m1"].states[-1].tick < 999
@@ -86,7 +86,7 @@ def test_a_diverged_run_is_identical_to_its_last_record() -> None:
     entry=st.integers(0, 4),
     bit=st.one_of(st.just(0), st.just(63), st.integers(0, 51)),
 )
-def test_one_bit_of_a_vector_is_found_and_named(
+def test_one_changed_vector_bit_is_named(
     site: str, field: str, tick: int, entry: int, bit: int
 ) -> None:
     index = entry % VECTORS[field]
@@ -101,7 +101,7 @@ def test_one_bit_of_a_vector_is_found_and_named(
 
 @settings(max_examples=15)
 @given(site=st.sampled_from(SITES), tick=ticks, peer=st.integers(0, 1), bit=st.integers(0, 12))
-def test_one_bit_of_used_is_found_and_named(site: str, tick: int, peer: int, bit: int) -> None:
+def test_a_changed_bit_of_used_is_named(site: str, tick: int, peer: int, bit: int) -> None:
     name = [other for other in SITES if other != site][peer]
 
     def change(r: Record) -> None:
@@ -124,7 +124,7 @@ def test_a_changed_mode_is_found_and_named(site: str, tick: int) -> None:
     arrival=st.integers(0, 1),
     bit=st.integers(0, 12),
 )
-def test_one_bit_of_an_arrivals_tick_is_found_and_named(
+def test_one_changed_arrival_tick_is_named(
     site: str, tick: int, arrival: int, bit: int
 ) -> None:
     def change(r: Record) -> None:
@@ -176,7 +176,7 @@ def test_fields_that_nothing_computes_from_are_compared_too(field: str) -> None:
         ('scheme = "second_order"', 'scheme = "digital"'),
     ],
 )
-def test_one_other_number_in_the_embedded_scenario_is_found(old: str, new: str) -> None:
+def test_another_scenario_number_is_found(old: str, new: str) -> None:
     def scenario(text: str) -> str:
         assert old in text
         return text.replace(old, new, 1)
@@ -204,7 +204,7 @@ def ranges(lost: set[int]) -> list[tuple[int, int]]:
         set(range(5, 80)),
     ],
 )
-def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[int]) -> None:
+def test_execution_resumes_behind_a_reported_gap(site: str, lost: set[int]) -> None:
     verdict = verify(without_records({site: lost}))
     assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [(site, first, last) for first, last in ranges(lost)]
@@ -242,7 +242,7 @@ def test_gaps_are_never_a_false_alarm(
 
 @settings(max_examples=12)
 @given(delays=under_way, never=never)
-def test_samples_out_of_order_late_or_never_are_no_difference(
+def test_scattered_samples_are_no_difference(
     delays: dict[Sample, int], never: frozenset[Sample]
 ) -> None:
     verdict = verify(opened(delivered(delays, never)))
@@ -251,7 +251,7 @@ def test_samples_out_of_order_late_or_never_are_no_difference(
 
 @settings(max_examples=20)
 @given(delays=under_way, never=never, lost=gaps(30, least=0), whole_run=st.booleans())
-def test_gaps_with_late_or_lost_samples_raise_no_false_alarm(
+def test_gaps_with_lost_samples_are_no_difference(
     delays: dict[Sample, int],
     never: frozenset[Sample],
     lost: dict[str, set[int]],
@@ -264,7 +264,7 @@ def test_gaps_with_late_or_lost_samples_raise_no_false_alarm(
     assert {gap[0] for gap in verdict.gaps} == set(lost)
 
 
-def test_a_gap_among_reordered_samples_is_no_false_alarm() -> None:
+def test_gaps_among_reordered_samples_are_no_difference() -> None:
     """Sample 45 comes at 53, after newer ones; record 50 is missing, and the first to be listed is 45."""
     delays = {("m2", peer, tick): way for peer in (0, 1) for tick, way in ((45, 8), (52, 5))}
     data = delivered(delays)
@@ -289,7 +289,7 @@ def test_a_record_that_stands_twice_is_found() -> None:
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_on_another_platform_each_tick_follows_from_two_before_it(name: str) -> None:
+def test_other_platforms_execute_from_two_records(name: str) -> None:
     data = recorded(name, {"duration_s": 0.5})
     verdict = verify(opened(edited(data, session=OTHER_PLATFORM)))
     assert not verdict.whole_run
@@ -299,9 +299,7 @@ def test_on_another_platform_each_tick_follows_from_two_before_it(name: str) -> 
 
 @pytest.mark.parametrize("field", sorted(VECTORS))
 @pytest.mark.parametrize("tick", [0, 1, 60, TICKS - 1])
-def test_on_another_platform_a_change_beyond_the_tolerance_is_found(
-    field: str, tick: int
-) -> None:
+def test_other_platforms_find_changes_beyond_tolerance(field: str, tick: int) -> None:
     def change(r: Record) -> None:
         r[field][1] += 1e-6 * (1 + abs(r[field][1]))
 
@@ -320,7 +318,7 @@ def test_on_another_platform_rounding_is_no_difference() -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
-def test_torn_log_is_verified_as_far_as_it_is_whole(share: float) -> None:
+def test_torn_logs_verify_while_whole(share: float) -> None:
     data = edited(recorded("paper"), chunk_bytes=2048)
     log = opened(data[: int(share * len(data))])
     assert not log.complete

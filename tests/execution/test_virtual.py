@@ -1,4 +1,4 @@
-"""Virtual time: who steps when, what arrives when, and what the driver may not decide (L2).
+"""Virtual time: the order of steps and arrivals, which the driver may not decide (L2).
 
 A log against virtual time: fed with its arrivals, and plain (the flagship corollary of L2).
 """
@@ -41,7 +41,7 @@ def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.
 
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
-def test_sites_step_in_order_of_time_and_then_of_scenario(rate_hz: Rates) -> None:
+def test_sites_step_by_time_then_scenario_order(rate_hz: Rates) -> None:
     scenario = small(rate_hz)
     ran = [
         (o.t_ns, scenario.names.index(site.name), o.tick)
@@ -49,8 +49,8 @@ def test_sites_step_in_order_of_time_and_then_of_scenario(rate_hz: Rates) -> Non
     ]
     assert ran == sorted(ran)
     for index, name in enumerate(scenario.names):
-        made = [tick for _, i, tick in ran if i == index]
-        assert made == list(range(scenario.ticks(name)))
+        ticks = [tick for _, i, tick in ran if i == index]
+        assert ticks == list(range(scenario.ticks(name)))
         assert scenario.ticks(name) == max(1, round(Fraction(1, 10) * rate_hz[index]))
 
 
@@ -71,7 +71,7 @@ def test_every_sample_arrives_once_right_after_its_stamp(rate_hz: Rates) -> None
 
 
 class ScatteredNetwork(PromptNetwork):
-    """Delivers each sample some ticks later than it could, in any order, as long as it is not due."""
+    """Delivers each sample some ticks later than possible, in any order, but before it is due."""
 
     def __init__(self, scenario: Scenario, slack: Sequence[int]) -> None:
         super().__init__({name: spec.rate_hz for name, spec in scenario.sites.items()})
@@ -97,7 +97,7 @@ def without_arrivals(ran: Sequence[virtual.SiteTick]) -> list[TickRecord]:
 
 @settings(max_examples=8)
 @given(slack=st.lists(st.integers(0, 17), min_size=1, max_size=12))
-def test_the_network_decides_nothing_while_samples_come_before_due(slack: list[int]) -> None:
+def test_early_samples_make_the_network_irrelevant(slack: list[int]) -> None:
     scenario = small((1000, 1000, 1000))
     scattered = virtual.execute_virtual(scenario, ScatteredNetwork(scenario, slack))
     assert without_arrivals(list(scattered)) == without_arrivals(
@@ -105,14 +105,14 @@ def test_the_network_decides_nothing_while_samples_come_before_due(slack: list[i
     )
 
 
-def test_a_sample_beyond_its_due_tick_does_change_the_run() -> None:
+def test_overdue_samples_change_the_run() -> None:
     scenario = small((1000, 1000, 1000))
     late = list(virtual.execute_virtual(scenario, ScatteredNetwork(scenario, [0, 25])))
     assert without_arrivals(late) != without_arrivals(list(virtual.execute_virtual(scenario)))
     assert any(sum(c.late for c in site.counts()) for site, _, _ in late)
 
 
-def test_record_says_whether_the_run_stayed_within_its_limits() -> None:
+def test_records_show_whether_limits_held() -> None:
     fine, wild = io.BytesIO(), io.BytesIO()
     assert virtual.write_virtual_log(small((1000,) * 3), fine)
     assert not virtual.write_virtual_log(
@@ -124,7 +124,7 @@ def test_record_says_whether_the_run_stayed_within_its_limits() -> None:
     assert [kind for _, kind in kinds].count("end") == 3
 
 
-def test_simulate_gives_the_log_of_a_scenario_with_overrides() -> None:
+def test_simulate_applies_overrides() -> None:
     log = simulate("paper", set={"control.Kd": 5, "duration_s": 0.05})
     assert log.scenario.sites["s"].control.Kd == (5.0, 5.0)
     assert (log.driver, len(log["s"])) == ("virtual", 50)
@@ -135,11 +135,13 @@ def test_simulate_gives_the_log_of_a_scenario_with_overrides() -> None:
 
 
 @pytest.mark.parametrize("site", ["m1", "s"])
-def test_a_virtual_boot_is_a_function_of_scenario_and_name(site: str) -> None:
-    one, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
-    assert virtual.compute_boot(one, site) == virtual.compute_boot(load_scenario("paper"), site)
-    assert virtual.compute_boot(one, site) != virtual.compute_boot(other, site)
-    assert virtual.compute_boot(one, "m1") != virtual.compute_boot(one, "s")
+def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
+    scenario, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
+    assert virtual.compute_boot(scenario, site) == virtual.compute_boot(
+        load_scenario("paper"), site
+    )
+    assert virtual.compute_boot(scenario, site) != virtual.compute_boot(other, site)
+    assert virtual.compute_boot(scenario, "m1") != virtual.compute_boot(scenario, "s")
 
 
 def opened_delivered(delays: dict[Sample, int]) -> Log:
@@ -151,7 +153,7 @@ links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integer
 
 @settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, DUE), max_size=30))
-def test_a_run_without_late_samples_equals_plain_virtual_time(
+def test_runs_without_late_samples_equal_virtual_time(
     delays: dict[Sample, int],
 ) -> None:
     twins = compare_with_virtual(opened_delivered(delays))
@@ -162,7 +164,7 @@ def test_a_run_without_late_samples_equals_plain_virtual_time(
 
 @settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, 39), min_size=1, max_size=30))
-def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
+def test_fed_virtual_time_always_equals_its_log(
     delays: dict[Sample, int],
 ) -> None:
     log = opened_delivered(delays)
@@ -178,7 +180,7 @@ def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
         assert twins.plain.first.tick >= min(late.due_tick for late in twins.late)
 
 
-def test_plain_virtual_time_differs_from_the_first_late_sample_on() -> None:
+def test_plain_virtual_time_differs_from_late_samples() -> None:
     log = opened_delivered({("m2", 1, 40): 25})
     (late,) = find_absent_samples(log)
     assert late == ("m2", "s", 40, 60, 65)
@@ -189,8 +191,8 @@ def test_plain_virtual_time_differs_from_the_first_late_sample_on() -> None:
     assert 0 < twins.plain.identical < twins.plain.records == 360
 
 
-def test_an_overtaken_late_sample_is_counted_and_harmless() -> None:
-    """It is missed for one tick; from then on the newest is in use as ever, but the state has moved."""
+def test_an_overtaken_late_sample_is_harmless() -> None:
+    """The sample is missed for one tick; from then on the newest is in use, but the state has moved."""
     twins = compare_with_virtual(opened_delivered({("m1", 0, 30): 39}))
     assert [sample.tick for sample in twins.late] == [30]
     assert twins.plain.first is not None
@@ -199,7 +201,7 @@ def test_an_overtaken_late_sample_is_counted_and_harmless() -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric", "two_sites"])
-def test_a_virtual_log_equals_virtual_time_both_ways(name: str) -> None:
+def test_virtual_logs_equal_virtual_time(name: str) -> None:
     log = opened(recorded(name, {"duration_s": 0.5}))
     twins = compare_with_virtual(log)
     assert twins.late == []
@@ -223,8 +225,8 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
 
 @pytest.mark.parametrize("entry", [[70_000, 3, 0], [-1, 3, 0], [0, 2**58, 0], [0, -5, 0]])
 @pytest.mark.parametrize("gap", [range(0), range(5, 80)])
-def test_a_sample_of_nobody_is_never_late(entry: list[int], gap: range) -> None:
-    """Not where so many records are missing, either, that no arrivals are assumed."""
+def test_foreign_samples_are_never_late(entry: list[int], gap: range) -> None:
+    """Also if so many records are missing that no arrivals are assumed."""
 
     def record(r: dict) -> dict | None:
         if (r["site"], r["tick"]) == ("s", 90):
@@ -236,7 +238,7 @@ def test_a_sample_of_nobody_is_never_late(entry: list[int], gap: range) -> None:
     assert twins.plain.first is None
 
 
-def test_the_twin_without_hands_has_nobody_at_the_arms() -> None:
+def test_twins_without_hands_are_free() -> None:
     log = opened(recorded("paper", {"duration_s": 1.2}))
     twin = simulate_without_operators(log)
     assert (twin["m1"].tau_x == 0.0).all()

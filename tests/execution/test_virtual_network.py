@@ -1,4 +1,4 @@
-"""What came to a site, by its records; where there is none, what must have come."""
+"""Arrivals at a site by its records, and inferred arrivals where records are missing."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,12 +30,12 @@ lost_ticks = st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50)
 
 
 def steady(ticks: int = 1) -> Way:
-    """Every sample comes after so many ticks."""
+    """Returns arrivals with the same number of ticks for every sample."""
     return {(peer, tick): ticks for peer in (0, 1) for tick in range(TICKS)}
 
 
 def in_order(under_way: Way) -> Way:
-    """Holds each sample back until those of the same peer before it have come."""
+    """Holds each sample back until the earlier samples of the same peer have come."""
     held: Way = {}
     for peer in (0, 1):
         arrives = 0
@@ -46,7 +46,7 @@ def in_order(under_way: Way) -> Way:
 
 
 def record(k: int) -> TickRecord:
-    """The record of a tick at which nothing moves."""
+    """Returns the record of a tick at which nothing moves."""
     two, five = [0.0] * 2, [0.0] * 5
     return TickRecord(
         k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], []
@@ -54,7 +54,7 @@ def record(k: int) -> TickRecord:
 
 
 def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
-    """The records of a site at 1 kHz, but for the ones that are lost."""
+    """Returns the records of a site at 1 kHz, but for the lost ones."""
     at: dict[int, list[Arrival]] = {}
     for (peer, tick), ticks in way.items():
         if ticks is not None:
@@ -75,69 +75,74 @@ def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
     return SiteLog("s", PEERS, 1000, payloads, "a test")
 
 
-def entries(came: Deliveries) -> set[Sample]:
-    """Every sample that comes, at any tick."""
-    return {(entry[0], entry[1]) for at in came.entries.values() for entry in at}
+def entries(deliveries: Deliveries) -> set[Sample]:
+    """Returns every sample that arrives, at any tick."""
+    return {(entry[0], entry[1]) for at in deliveries.entries.values() for entry in at}
 
 
-def test_of_a_whole_log_it_is_what_the_records_list() -> None:
+def test_whole_logs_give_their_recorded_arrivals() -> None:
     part = short(steady(3))
-    came = complete_deliveries(part, *SENDERS)
-    assert came == read_deliveries(part)
-    assert came.entries == {state.tick: state.rx for state in part.states}
-    assert (came.first, came.last, came.unrecorded) == (0, TICKS - 1, frozenset())
+    deliveries = complete_deliveries(part, *SENDERS)
+    assert deliveries == read_deliveries(part)
+    assert deliveries.entries == {state.tick: state.rx for state in part.states}
+    assert (deliveries.first, deliveries.last, deliveries.unrecorded) == (
+        0,
+        TICKS - 1,
+        frozenset(),
+    )
 
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
-def test_on_a_steady_network_missing_records_are_found(lost: set[int], ticks: int) -> None:
-    whole, came = (
+def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> None:
+    whole, deliveries = (
         short(steady(ticks)),
         complete_deliveries(short(steady(ticks), lost), *SENDERS),
     )
-    assert came.unrecorded == lost
-    pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.entries.items() if at}
+    assert deliveries.unrecorded == lost
+    pairs = {k: sorted(entry[:2] for entry in at) for k, at in deliveries.entries.items() if at}
     assert pairs == {
         state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx
     }
 
 
 @given(under_way=delays, lost=lost_ticks)
-def test_on_any_network_every_arrived_sample_is_there_once(
-    under_way: Way, lost: set[int]
-) -> None:
-    """In order, of samples older than the newest that a record lists: of later ones nobody knows."""
+def test_every_arrived_sample_is_listed_once(under_way: Way, lost: set[int]) -> None:
+    """In order, for samples older than the newest that a record lists; later samples are unknown."""
     whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
-    came = complete_deliveries(gapped, *SENDERS)
+    deliveries = complete_deliveries(gapped, *SENDERS)
     for state in gapped.states:
-        assert came.entries[state.tick] == state.rx
-    assert sum(map(len, came.entries.values())) == len(entries(came))
+        assert deliveries.entries[state.tick] == state.rx
+    assert sum(map(len, deliveries.entries.values())) == len(entries(deliveries))
     listed = entries(read_deliveries(gapped))
     newest = [max((tick for j, tick in listed if j == peer), default=-1) for peer in (0, 1)]
-    assert {s for s in entries(came) if s[1] <= newest[s[0]]} == {
+    assert {s for s in entries(deliveries) if s[1] <= newest[s[0]]} == {
         s for s in entries(read_deliveries(whole)) if s[1] <= newest[s[0]]
     }
-    assert all(k > tick for k, at in came.entries.items() for _, tick, _ in at)
+    assert all(k > tick for k, at in deliveries.entries.items() for _, tick, _ in at)
 
 
-def test_what_never_came_does_not_come() -> None:
+def test_a_lost_sample_does_not_come() -> None:
     """Sample 50 was lost, far from any gap."""
-    came = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), *SENDERS)
-    assert (0, 50) not in entries(came)
-    assert {(1, 50), (0, 20), (0, 79)} <= entries(came)
+    deliveries = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), *SENDERS)
+    assert (0, 50) not in entries(deliveries)
+    assert {(1, 50), (0, 20), (0, 79)} <= entries(deliveries)
 
 
 rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 
 
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
-def test_at_other_rates_every_sample_travels_as_long(
-    ticks: int, rate_hz: int, peer_rate_hz: int
-) -> None:
-    came = read_deliveries(short(steady(ticks)))
-    there = retime_deliveries(came, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
-    assert there.last == 119 * rate_hz // 1000
+def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
+    deliveries = read_deliveries(short(steady(ticks)))
+    later_deliveries = retime_deliveries(
+        deliveries, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000]
+    )
+    assert later_deliveries.last == 119 * rate_hz // 1000
     first = [
-        (k, m) for k in sorted(there.entries) for peer, m, _ in there.entries[k] if peer == 0
+        (k, m)
+        for k in sorted(later_deliveries.entries)
+        for peer, m, _ in later_deliveries.entries[k]
+        if peer == 0
     ]
     assert first
     assert [m for _, m in first] == list(range(len(first)))
@@ -146,17 +151,17 @@ def test_at_other_rates_every_sample_travels_as_long(
         assert ticks * 1e-3 - 1e-6 <= way_s <= ticks * 1e-3 + 1 / rate_hz
 
 
-def test_at_other_rates_what_never_came_does_not_come() -> None:
-    came = read_deliveries(short({**steady(), (0, 50): None}))
-    doubled = retime_deliveries(came, 1000, 1000, [1000, 1000], [2000, 1000])
+def test_other_rates_keep_lost_samples_lost() -> None:
+    deliveries = read_deliveries(short({**steady(), (0, 50): None}))
+    doubled = retime_deliveries(deliveries, 1000, 1000, [1000, 1000], [2000, 1000])
     assert not {(0, 100), (0, 101)} & entries(doubled)
     assert {(0, 99), (0, 102), (1, 50)} <= entries(doubled)
 
 
-def test_of_too_many_assumed_samples_the_newest_arrive() -> None:
+def test_only_the_newest_assumed_samples_arrive() -> None:
     """A tick takes MAX_ARRIVALS; behind a long gap of a log more may be assumed to have come."""
     ticks = range(MAX_ARRIVALS + 5)
     network = RecordedNetwork({"s": {9: [(0, tick, 0) for tick in ticks]}}, {"s": ["m1"]})
     for tick in ticks:
         network.send("m1", record(tick))
-    assert [one.tick for one in network.deliver("s", 9)] == [*ticks[5:]]
+    assert [arrival.tick for arrival in network.deliver("s", 9)] == [*ticks[5:]]

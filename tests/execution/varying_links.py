@@ -1,4 +1,4 @@
-"""Links whose delays vary in every way: in order, played out, over time, in bursts and twice."""
+"""Links whose delays vary in every way: in order, with play-out, over time, in bursts and with copies."""
 
 from typing import Any
 

@@ -44,12 +44,20 @@ class Seeds(NamedTuple):
 
     @property
     def failed(self) -> list[tuple[int, Judged]]:
-        return [(seed, one) for seed, one in enumerate(self.judged) if one.violations]
+        return [
+            (seed, judged_seed)
+            for seed, judged_seed in enumerate(self.judged)
+            if judged_seed.violations
+        ]
 
     def of(self, kind: str) -> list[Judged]:
         if kind == "several":
-            return [one for one in self.judged if len(one.faults) > 1]
-        return [one for one in self.judged if kind in {fault.kind for fault in one.faults}]
+            return [judged_seed for judged_seed in self.judged if len(judged_seed.faults) > 1]
+        return [
+            judged_seed
+            for judged_seed in self.judged
+            if kind in {fault.kind for fault in judged_seed.faults}
+        ]
 
 
 def judge_seeds(count: int, jobs: int | None) -> Seeds:
@@ -68,14 +76,14 @@ def find_tests(wanted: Sequence[str]) -> list[str]:
         path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
         for path in (ROOT / LIVE).glob("test_*.py")
     }
-    found = []
+    names = []
     for name in wanted:
         if "/" in name:
-            found.append(name)
+            names.append(name)
             continue
         (file,) = (file for file, text in files.items() if f"def test_{name}(" in text)
-        found.append(f"{file}::test_{name}")
-    return found
+        names.append(f"{file}::test_{name}")
+    return names
 
 
 def run_tests(names: Sequence[str]) -> dict[str, str]:
@@ -94,11 +102,11 @@ def run_tests(names: Sequence[str]) -> dict[str, str]:
     for word, name in re.findall(
         r"^(PASSED|FAILED|ERROR|SKIPPED) (\S+)", done.stdout, re.MULTILINE
     ):
-        for asked in names:
-            if name.startswith(asked):
-                ends.setdefault(asked, set()).add(word)
+        for listed in names:
+            if name.startswith(listed):
+                ends.setdefault(listed, set()).add(word)
     bad = {"FAILED", "ERROR"}
-    return {name: "failed" if bad & found else "passed" for name, found in ends.items()}
+    return {name: "failed" if bad & bad_tests else "passed" for name, bad_tests in ends.items()}
 
 
 class Evidence(NamedTuple):
@@ -122,8 +130,8 @@ class Evidence(NamedTuple):
 
 
 def find_evidence(row: Row, seeds: Seeds, ends: dict[str, str]) -> Evidence:
-    sessions = [one for kind in row.kinds for one in seeds.of(kind)]
-    broken = sum(bool(one.violations) for one in sessions)
+    sessions = [judged_seed for kind in row.kinds for judged_seed in seeds.of(kind)]
+    broken = sum(bool(session.violations) for session in sessions)
     names = find_tests((*row.virtual, *row.real))
     results = {name: ends.get(name, "not run") for name in names}
     return Evidence(row, len(sessions), broken, results)
@@ -150,7 +158,7 @@ def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]
 
 
 def describe_seeds(seeds: Seeds) -> list[str]:
-    holds = [ticks for one in seeds.judged for ticks in one.holds]
+    holds = [ticks for judged_seed in seeds.judged for ticks in judged_seed.holds]
     each_s = seeds.took_s / len(seeds.judged)
     count, broken, most = len(seeds.judged), len(seeds.failed), max(holds, default=0)
     return [
@@ -162,7 +170,9 @@ def describe_seeds(seeds: Seeds) -> list[str]:
 
 def count_visits(seeds: Seeds) -> list[tuple[str, int]]:
     """Returns what sessions came by (modes, events, faults, what was dropped), each with its count."""
-    visited: Counter[str] = sum((one.visited for one in seeds.judged), Counter())
+    visited: Counter[str] = sum(
+        (judged_seed.visited for judged_seed in seeds.judged), Counter()
+    )
     return sorted(visited.items())
 
 
@@ -175,7 +185,9 @@ def describe_torques(seeds: Seeds) -> str:
     stepped = ", ".join(f"{mode} {step_nm:.3g}" for mode, step_nm in sorted(steps.items()))
     undisturbed_nm = find_undisturbed_step()
     allowed_nm = allowed_step(make_scenario(), undisturbed_nm)
-    at_rest_j, before_j = (max(one.rises_j[place] for one in seeds.judged) for place in (0, 1))
+    at_rest_j, before_j = (
+        max(one.rises_j[mode_index] for one in seeds.judged) for mode_index in (0, 1)
+    )
     return (
         f"Largest step of a torque in a tick, N m: {stepped} (`start`: the first 0.1 s of every start). "
         f"Allowed are {allowed_nm:.3g}, the larger of the limit of its rate and 1.1 times the "
@@ -194,33 +206,39 @@ def main() -> int:
         help="run the matrix's tests too, and write docs/data and docs/reference/faults.md",
     )
     parser.add_argument("--jobs", type=int, help="processes at a time; all cores if left out")
-    asked = parser.parse_args()
-    seeds = judge_seeds(asked.seeds, asked.jobs)
+    arguments = parser.parse_args()
+    seeds = judge_seeds(arguments.seeds, arguments.jobs)
     lines = describe_seeds(seeds)
     torques = describe_torques(seeds)
     print("\n".join([*lines, "", torques]))
-    if asked.write:
+    if arguments.write:
         ends = run_tests(
             find_tests([name for row in ROWS for name in (*row.virtual, *row.real)])
         )
-        found = [find_evidence(row, seeds, ends) for row in ROWS]
+        all_evidence = [find_evidence(row, seeds, ends) for row in ROWS]
         write_table(
             MATRIX,
             ("number", "fault", "what must happen", "not tried"),
-            [describe_row(evidence) for evidence in found],
+            [describe_row(evidence) for evidence in all_evidence],
         )
         write_table(
             TESTS,
             ("fault", "evidence", "result"),
-            [line for evidence in found for line in list_evidence(evidence)],
+            [line for evidence in all_evidence for line in list_evidence(evidence)],
         )
         write_table(COUNTS, ("event", "count"), count_visits(seeds))
         TORQUES.write_text(torques + "\n", "utf-8")
         text = PAGE.read_text("utf-8")
         before, _, rest = text.partition(BEGIN)
-        made = "\n".join([BEGIN, "", *lines, "", END])
-        PAGE.write_text(before + made + rest.partition(END)[2], "utf-8")
-        print("\n".join(" | ".join(describe_row(one)) for one in found if not one.holds))
+        block = "\n".join([BEGIN, "", *lines, "", END])
+        PAGE.write_text(before + block + rest.partition(END)[2], "utf-8")
+        print(
+            "\n".join(
+                " | ".join(describe_row(row_found))
+                for row_found in all_evidence
+                if not row_found.holds
+            )
+        )
     return int(bool(seeds.failed))
 
 

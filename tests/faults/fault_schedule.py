@@ -1,7 +1,7 @@
-"""What goes wrong in a session, and when: drawn from a seed, or given.
+"""The faults of a session and their times: drawn from a seed, or given.
 
-All of it happens within the trouble of a timetable; what is left of the session after it must be enough for
-everybody to follow everybody again.
+All faults lie within the trouble of a timetable. The rest of the session must be long enough
+for all sites to follow their peers again.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,14 +19,14 @@ MOST_FAULTS = 4
 
 
 class Timetable(NamedTuple):
-    """When what may go wrong in a session; tick 0 is at 0 s.
+    """Times of the faults in a session; tick 0 is at 0 s.
 
     Attributes:
-        length_s: of the session.
-        trouble_s: when faults begin.
-        healed_s: all have ended by then.
-        engaged_s: so long before the end everybody follows everybody again.
-        without: kinds of faults from which nobody would be back in time.
+        length_s: Length of the session.
+        trouble_s: First and last time at which a fault may begin.
+        healed_s: Time at which all faults have ended.
+        engaged_s: Time before the end at which all sites follow their peers again.
+        without: Kinds of faults from which a site would not recover in time.
     """
 
     length_s: float
@@ -41,13 +41,13 @@ SHORT = Timetable(1.4, (0.4, 0.52), 0.57, 0.05, ("kill", "end", "stop", "storm")
 
 
 class ArmSettings(NamedTuple):
-    """What the arms of a session are given; the defaults are those of the matrix.
+    """Settings of the arms; the defaults are those of the matrix.
 
     Attributes:
-        tau_rate_limit_nm_s: limit of a torque's rate; None: there is none.
-        learnt: which share of the true parameters the estimates begin with.
-        qd_limit_rad_s: limit of the speeds; one that the arms' own motion passes is a fault.
-        start_rad_s: speed of each joint of every arm as it starts, up to that limit.
+        tau_rate_limit_nm_s: Limit of a torque's rate; None without a limit.
+        learnt: Share of the true parameters with which the estimates begin.
+        qd_limit_rad_s: Limit of the speeds; a limit below the arms' own motion makes a fault.
+        start_rad_s: Speed of each joint of every arm at its start, up to that limit.
     """
 
     tau_rate_limit_nm_s: float | None = 300.0
@@ -69,14 +69,14 @@ def draw_settings(seed: int) -> ArmSettings:
 
 
 class Fault(NamedTuple):
-    """One thing that goes wrong.
+    """One fault.
 
     Attributes:
-        kind: one of `KINDS`.
-        at_s: when, s since tick 0.
-        for_s: how long.
-        of: whom it befalls: a site, or sender and receiver.
-        size: how much, in the kind's own measure.
+        kind: One of `KINDS`.
+        at_s: Time of the fault, s since tick 0.
+        for_s: Duration, s.
+        of: The affected site, or sender and receiver.
+        size: Size, in the unit of the kind.
     """
 
     kind: str
@@ -104,7 +104,9 @@ def _nobody(_rng: Random) -> tuple[str, ...]:
 
 
 class Kind(NamedTuple):
-    """How a kind is drawn: how often among others, whom it befalls, its sizes."""
+    """How a kind of fault is drawn: its weight among the kinds, the affected members, and its
+    sizes.
+    """
 
     weight: float
     of: Callable[[Random], tuple[str, ...]]
@@ -164,17 +166,20 @@ def order_of(fault: Fault) -> tuple[str, ChangeRequest]:
 
 
 def storm_of(fault: Fault) -> list[tuple[float, str, ChangeRequest]]:
-    """What somebody asks of the sites in a storm of orders, and when, s after it begins."""
+    """Returns the orders to the sites in a storm, with their times, s after its beginning."""
     rng = Random(f"storm {fault.size}")
     lasts_s = min(fault.for_s, STORM_S)
     orders = []
     for _ in range(max(2, round(STORM_ORDERS * lasts_s / STORM_S))):
         site = _a_site(rng)
         if rng.random() < 0.8:
-            asked: tuple[str, ChangeRequest] = (*site, ChangeRequest(order=rng.choice(LATCHES)))
+            request: tuple[str, ChangeRequest] = (
+                *site,
+                ChangeRequest(order=rng.choice(LATCHES)),
+            )
         else:
-            asked = order_of(Fault("order", 0.0, 0.0, site, rng.random()))
-        orders.append((rng.uniform(0.0, lasts_s), *asked))
+            request = order_of(Fault("order", 0.0, 0.0, site, rng.random()))
+        orders.append((rng.uniform(0.0, lasts_s), *request))
     return sorted(orders, key=lambda order: order[0])
 
 

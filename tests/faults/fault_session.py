@@ -1,4 +1,6 @@
-"""A session of three sites and a recorder with faults, in one process, and what was published in it."""
+"""A session of three sites and a recorder with faults, in one process, and its published
+messages.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -60,7 +62,9 @@ KEYS: dict[str, Any] = {
 
 @cache
 def make_scenario(timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS) -> Scenario:
-    """The paper's arms and law without hands, which wait, align, hold and come back."""
+    """Returns the paper's arms and law without hands, under the rule that waits, aligns, holds
+    and returns.
+    """
     keys: dict[str, Any] = {"limits.qd_limit_rad_s": arms.qd_limit_rad_s}
     if arms.tau_rate_limit_nm_s is not None:
         keys["limits.tau_rate_limit_nm_s"] = arms.tau_rate_limit_nm_s
@@ -75,11 +79,11 @@ def make_scenario(timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS
 
 @dataclass
 class Published:
-    """What the sites of a session published.
+    """The published messages of the sites of a session.
 
     Attributes:
-        states: every record, by site, in the order in which it was sent.
-        events: every event.
+        states: Every record, by site, in the order of sending.
+        events: Every event.
     """
 
     states: dict[str, list[State]] = field(default_factory=lambda: {name: [] for name in SITES})
@@ -92,7 +96,7 @@ INSISTS_NS = 300_000_000
 
 @dataclass
 class FaultSession(Session):
-    """A session on a network that fails, with everything that its sites publish."""
+    """A session on a faulty network, with all messages of its sites."""
 
     faults: Sequence[Fault] = ()
     seed: int = 0
@@ -161,7 +165,7 @@ class FaultSession(Session):
                 self._begin()
 
     def _begin(self) -> None:
-        """Tick 0 is known: sets the time of every fault."""
+        """Sets the time of every fault, once tick 0 is known."""
         for fault, clock, interrupt, _ in self.plans:
             at_ns = self._at(fault.at_s)
             if fault.kind == "kill":
@@ -243,11 +247,13 @@ class FaultSession(Session):
         bus.close()
 
     def _replay(self, fault: Fault) -> None:
-        name = next(one for one in fault.of if one in SITES)
+        name = next(site for site in fault.of if site in SITES)
         self._publish(topics.key(SESSION, name, topics.SAMPLE), self._recent[name][-600:-100:5])
 
     def _stranger(self, fault: Fault) -> None:
-        """The newest samples of a site as of another start, and far ahead, and what is no sample at all."""
+        """Publishes the newest samples of a site as if of another start, and far ahead, and
+        invalid samples.
+        """
         (name,) = fault.of
         loads, junk = [], (b"", b"\xff" * 2000)
         for load in [load for load in self._recent[name] if load not in junk][-50:]:
@@ -266,9 +272,9 @@ class FaultSession(Session):
     def _order(self, fault: Fault) -> None:
         self._ask(*order_of(fault))
 
-    def _ask(self, site: str, asked: ChangeRequest) -> None:
+    def _ask(self, site: str, change_request: ChangeRequest) -> None:
         bus = self.network.join_as("operator")
-        bus.query(topics.key(SESSION, site, topics.SET), encode(asked))
+        bus.query(topics.key(SESSION, site, topics.SET), encode(change_request))
         bus.close()
 
     def _stop(self, fault: Fault) -> None:
@@ -295,7 +301,8 @@ class FaultSession(Session):
     def play(self) -> None:
         """See `Session`; starts are numbered by the seed.
 
-        Rehearsals, which leave no trace, are short, and memories hold all that these sessions make, no more.
+        Rehearsals, which leave no trace, are short, and memories have just enough room for
+        these sessions.
         """
         boots = iter(lambda: self._boots.getrandbits(63) | 1 << 40, 0)
         patches = [
@@ -318,7 +325,9 @@ class FaultSession(Session):
         published = Published()
         for name, payloads in self._payloads.items():
             for payload in payloads:
-                published.states[name] += [decode(one, State) for one in split_states(payload)]
+                published.states[name] += [
+                    decode(state, State) for state in split_states(payload)
+                ]
         for payload in self._events:
             try:
                 published.events.append(decode(payload, Event))
@@ -338,7 +347,7 @@ def run_faults(
     timetable: Timetable = WHOLE,
     arms: ArmSettings = DEFAULT_ARMS,
 ) -> FaultSession:
-    """A session with these faults, run to its end."""
+    """Returns a session with these faults, run to its end."""
     scenario = make_scenario(timetable, arms)
     session = FaultSession(
         scenario, folder / "run.mcap", faults=faults, seed=seed, timetable=timetable

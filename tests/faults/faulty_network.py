@@ -1,10 +1,12 @@
-"""A network in one process whose ways fail: cut, one-way, slow, lossy, doubling, out of order, corrupting.
+"""A network in one process with faulty ways: cut, one-way, slow, lossy, doubling, disordering,
+corrupting.
 
-A way leads from one member to another. While it is cut, what is sent is kept, as by a transport that sends
-again, and comes in one burst when it is mended soon; a cut as long as a lease ends the connection: what was
-kept is gone, and each side sees the other's liveliness token disappear until the way is mended. A bit that
-flips on its way ends the connection at once: TLS sees it, and hands nothing on
-(tests/net/test_member_keys.py). What a member itself sends wrong comes as it was sent.
+A way leads from one member to another. A cut way keeps the messages, like a transport that
+sends again. If the way is mended soon, the messages arrive in one burst. A cut as long as a
+lease ends the connection: the kept messages are lost, and each side sees the other's liveliness
+token disappear until the way is mended. A flipped bit ends the connection at once, because TLS
+finds the bit and delivers nothing (tests/net/test_member_keys.py). An invalid message of a
+member itself arrives as it was sent.
 """
 
 from collections import deque
@@ -26,18 +28,18 @@ Deliver = Callable[[str, bytes], None]
 
 @dataclass
 class Way:
-    """What happens to messages from one member to another.
+    """The treatment of messages from one member to another.
 
     Attributes:
-        cut_ns: since when nothing passes; None: it is open.
-        ended: True once a lease has passed since then.
-        delay_ns: every message takes so long.
-        jitter_ns: and up to so much longer, so that messages overtake each other.
-        loss, doubled, wrong: shares of the messages of sites to which that happens; wrong ones have a bit of
-            another value.
-        tokens: liveliness tokens of the sender that the receiver knows, while the way is cut.
-        kept: what was sent since the way was cut.
-        touched: True once anything of this was ever set.
+        cut_ns: Time since which no message passes; None if the way is open.
+        ended: True once a lease has passed since the cut.
+        delay_ns: Delay of every message.
+        jitter_ns: Largest additional delay, so that messages overtake each other.
+        loss, doubled, wrong: Shares of the sites' messages that are lost, doubled or
+            corrupted; in a corrupted message one bit differs.
+        tokens: Liveliness tokens of the sender that the receiver knows, while the way is cut.
+        kept: Messages since the cut.
+        touched: True once any of these settings was changed.
     """
 
     cut_ns: int | None = None
@@ -53,7 +55,7 @@ class Way:
 
 
 class FaultyNetwork(LocalNetwork):
-    """The network of some members on a relay's time; chance comes from a seed."""
+    """The network of some members on a relay's time; random draws follow a seed."""
 
     def __init__(self, relay: Relay, seed: int) -> None:
         super().__init__()
@@ -69,7 +71,9 @@ class FaultyNetwork(LocalNetwork):
         return member
 
     def way(self, sender: str, receiver: str) -> Way:
-        """The way from one member to another, whoever runs under these names, of one who will set it."""
+        """Returns the way between two members, for a change of its settings; later starts keep
+        the way.
+        """
         way = self._way(sender, receiver)
         way.touched = True
         return way
@@ -85,7 +89,7 @@ class FaultyNetwork(LocalNetwork):
     def find_takers(
         self, sender: LocalBus, name: str, key: str
     ) -> Iterator[tuple[Way, Deliver]]:
-        """Who takes what a member sends under a key, and over which way."""
+        """Yields the ways and sinks of all members that receive a message under a key."""
         for member in self.members:
             if member is not sender:
                 for expression, sink in member._sinks:
@@ -103,9 +107,9 @@ class FaultyNetwork(LocalNetwork):
         if often and way.loss and chance.random() < way.loss:
             return
         if often and way.wrong and chance.random() < way.wrong:
-            place = chance.randrange(len(payload))
-            flipped = bytes([payload[place] ^ (1 << chance.randrange(8))])
-            payload = payload[:place] + flipped + payload[place + 1 :]
+            index = chance.randrange(len(payload))
+            flipped = bytes([payload[index] ^ (1 << chance.randrange(8))])
+            payload = payload[:index] + flipped + payload[index + 1 :]
         for _ in range(2 if way.doubled and chance.random() < way.doubled else 1):
             late_ns = way.delay_ns + (chance.randrange(way.jitter_ns) if way.jitter_ns else 0)
             if late_ns:
@@ -115,7 +119,7 @@ class FaultyNetwork(LocalNetwork):
                 sink(key, payload)
 
     def cut(self, sender: str, receiver: str) -> None:
-        """Nothing passes from now on; after a lease the connection has ended in both directions."""
+        """Blocks a way from now on; after a lease the connection ends in both directions."""
         way = self.way(sender, receiver)
         if way.cut_ns is not None:
             return
@@ -129,7 +133,9 @@ class FaultyNetwork(LocalNetwork):
         self._relay.happens(since_ns + LEASE_NS, end)
 
     def disconnect(self, one: str, other: str) -> None:
-        """Ends the connection of two members at once; it is made again where their ways are mended."""
+        """Ends the connection of two members at once; mending their ways makes a new
+        connection.
+        """
         for sender, receiver in ((one, other), (other, one)):
             self.cut(sender, receiver)
             self._end(self.way(sender, receiver), receiver)
@@ -151,7 +157,7 @@ class FaultyNetwork(LocalNetwork):
         self._tell_presence(now - known, receiver, True)
 
     def _tokens_of(self, sender: str) -> frozenset[str]:
-        return frozenset(token for one in self._named(sender) for token in one._tokens)
+        return frozenset(token for member in self._named(sender) for token in member._tokens)
 
     def _tell_presence(self, tokens: frozenset[str], receiver: str, alive: bool) -> None:
         for token in sorted(tokens):
@@ -159,7 +165,11 @@ class FaultyNetwork(LocalNetwork):
                 member.tell_presence(token, alive)
 
     def _named(self, name: str) -> Iterator["FaultyBus"]:
-        return (one for one in self.members if isinstance(one, FaultyBus) and one.name == name)
+        return (
+            member
+            for member in self.members
+            if isinstance(member, FaultyBus) and member.name == name
+        )
 
 
 class FaultyBus(LocalBus):
@@ -209,7 +219,7 @@ class FaultyBus(LocalBus):
         return publish
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """See `Bus`; who cannot be reached, or cannot reach the asker, does not answer."""
+        """See `Bus`; a member that is unreachable, or cannot reach the asker, does not answer."""
         everyone = self._faulty.members
         self._faulty.members = [
             member for member in everyone if member is self or self._meets(member)

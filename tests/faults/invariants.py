@@ -1,6 +1,6 @@
-"""What must hold in every session, whatever goes wrong in it: laws of its records, tick by tick.
+"""Invariants of every session under any faults: laws of its records, tick by tick.
 
-Each looks at what the sites published, on a way that no fault touches, or at the log.
+Each invariant examines the messages of the sites, as seen on a way without faults, or the log.
 """
 
 from collections.abc import Callable, Iterator, Sequence, Set
@@ -58,7 +58,7 @@ def stretches(states: Sequence[State]) -> Iterator[list[State]]:
 
 
 def check_edges(session: FaultSession) -> Iterator[str]:
-    """I1: modes change only as `session_life` draws it."""
+    """I1: modes change only along the edges of `session_life`."""
     for name, states in session.published.states.items():
         for stretch in stretches(states):
             # it may be ordered before its first tick
@@ -73,7 +73,9 @@ def check_edges(session: FaultSession) -> Iterator[str]:
 
 
 def check_limits(session: FaultSession) -> Iterator[str]:
-    """I2: what is published is finite and within the limits, but for the speed that made a fault."""
+    """I2: published numbers are finite and within the limits, except the speed that made a
+    fault.
+    """
     for name, states in session.published.states.items():
         setup = session.scenario.setup(name)
         keys = ("q", "qd", "tau", "q_des", "qd_des")
@@ -89,7 +91,9 @@ def check_limits(session: FaultSession) -> Iterator[str]:
 
 
 def count_silence(stretch: Sequence[State]) -> Iterator[tuple[State, int]]:
-    """Yields the records of a start, and for how many ticks the most silent peer has been so."""
+    """Yields the records of a start, each with the age in ticks of its most silent peer's last
+    sample.
+    """
     used, since = dict(stretch[0].used), dict.fromkeys(stretch[0].used, stretch[0].tick)
     for state in stretch:
         for peer, tick in state.used.items():
@@ -99,7 +103,9 @@ def count_silence(stretch: Sequence[State]) -> Iterator[tuple[State, int]]:
 
 
 def check_silence(session: FaultSession) -> Iterator[str]:
-    """I3 and I7: a site follows only while of every peer a sample came into use within the last 20 ticks."""
+    """I3 and I7: a site follows only if a sample of every peer came into use within the last 20
+    ticks.
+    """
     for name, states in session.published.states.items():
         for stretch in stretches(states):
             for state, silent in count_silence(stretch):
@@ -110,7 +116,7 @@ def check_silence(session: FaultSession) -> Iterator[str]:
 
 
 def find_holds(session: FaultSession) -> Iterator[int]:
-    """Ticks from the last sample of a peer that came into use to every hold."""
+    """Returns, for every hold, the ticks since the last sample of a peer came into use."""
     for states in session.published.states.values():
         for stretch in stretches(states):
             before = ""
@@ -121,7 +127,7 @@ def find_holds(session: FaultSession) -> Iterator[int]:
 
 
 def check_order(session: FaultSession) -> Iterator[str]:
-    """I4: of every peer the samples in use never go back, nor beyond the present."""
+    """I4: the samples in use of a peer never go back, nor beyond the present."""
     for name, states in session.published.states.items():
         for stretch in stretches(states):
             for before, after in pairwise(stretch):
@@ -132,9 +138,10 @@ def check_order(session: FaultSession) -> Iterator[str]:
 
 
 def largest_steps(published: Published, from_tick: int) -> dict[str, float]:
-    """The largest step of a torque between ticks, N m, by mode, in all starts, from a tick of each on.
+    """Returns the largest step of a torque between ticks, N m, by mode, in all starts, from a
+    tick on.
 
-    The first 0.1 s of a start are `start`.
+    The first 0.1 s of a start count as the mode `start`.
     """
     most: dict[str, float] = {}
     for states in published.states.values():
@@ -153,9 +160,10 @@ def largest_steps(published: Published, from_tick: int) -> dict[str, float]:
 
 
 def check_torque(session: FaultSession, undisturbed_nm: float) -> Iterator[str]:
-    """I6: the torque steps no more than its rate allows, or not much more than in the run without faults.
+    """I6: the torque steps by no more than its rate allows, or little more than without faults.
 
-    Of an arm that comes to rest also by what brakes it: B |qd| against its motion.
+    An arm that comes to rest may in addition step by its braking torque: B |qd| against its
+    motion.
     """
     allowed_nm = allowed_step(session.scenario, undisturbed_nm) * (1.0 + RESIDUAL)
     for name, states in session.published.states.items():
@@ -178,7 +186,7 @@ def check_torque(session: FaultSession, undisturbed_nm: float) -> Iterator[str]:
 
 
 def allowed_step(scenario: Scenario, undisturbed_nm: float) -> float:
-    """The most that a torque may step between ticks, brakes aside, N m."""
+    """Returns the largest allowed step of a torque between ticks without brakes, N m."""
     setup = scenario.setup(SITES[0])
     return max(
         STEP_SHARE * undisturbed_nm, float(np.max(setup.limits.tau_rate)) / setup.rate_hz
@@ -186,9 +194,11 @@ def allowed_step(scenario: Scenario, undisturbed_nm: float) -> float:
 
 
 def check_liveness(session: FaultSession) -> Iterator[str]:
-    """I8: once everything is mended, all follow each other, or are in fault by tight limits.
+    """I8: once all faults are mended, all sites follow each other, or are in fault by tight
+    limits.
 
-    Arms that start fast may come to rest farther apart than sites go to each other by themselves: they wait.
+    Arms that start fast may come to rest farther apart than sites approach on their own: they
+    wait.
     """
     rate_hz = session.scenario.sites[SITES[0]].rate_hz
     timetable = session.timetable
@@ -211,7 +221,7 @@ def check_liveness(session: FaultSession) -> Iterator[str]:
 
 
 def check_starts(session: FaultSession) -> Iterator[str]:
-    """I9: one start of a site after the other, and every tick once."""
+    """I9: the starts of a site follow one another, and every tick occurs once."""
     for name, states in session.published.states.items():
         boots = [boot for boot, _ in groupby(states, key=lambda state: state.boot)]
         if len(set(boots)) < len(boots):
@@ -222,12 +232,14 @@ def check_starts(session: FaultSession) -> Iterator[str]:
 
 
 def check_log(session: FaultSession) -> Iterator[str]:
-    """I10: what was published stands in the log, or is counted; and every record is what its inputs give."""
+    """I10: published records stand in the log, or are counted; and every record follows from
+    its inputs.
+    """
     if any(fault.kind == "full disk" for fault in session.faults):
         return  # its log ends where the disk does
     try:
         log = open_log(session.path)
-        found = verify(log)
+        verification = verify(log)
     except TrilatError as error:
         yield f"the log cannot be read: {error}"
         return
@@ -236,45 +248,48 @@ def check_log(session: FaultSession) -> Iterator[str]:
         name: find_altered(states, log[name].states)
         for name, states in session.published.states.items()
     }
-    if found.differing and not fed:
-        yield f"{found.differing} records differ when they are executed again"
+    if verification.differing and not fed:
+        yield f"{verification.differing} records differ when they are executed again"
     if any(altered.values()):
         if "recorder" not in fed:
             yield f"records in the log are not as they were published: {altered}"
-        elif not found.differing:
+        elif not verification.differing:
             yield f"nobody finds records that came otherwise than they were made: {altered}"
         return
     touched = any("recorder" in fault.of or fault.kind == "cut all" for fault in session.faults)
     for name in session.published.states:
-        there = set(log[name].tick.tolist())
-        lost = len(find_heard(session.published, name, there) - there)
+        recorded_ticks = set(log[name].tick.tolist())
+        lost = len(find_heard(session.published, name, recorded_ticks) - recorded_ticks)
         if lost != log.missing(name) or (lost and not touched):
             yield f"{name}: {lost} records are not in the log, which counts {log.missing(name)}"
 
 
 def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
-    """The ticks of a site's records that are known of: of a start that was killed up to the newest that came
-    to a site which is there when the next one begins.
+    """Returns the ticks of a site's records that another member knows.
 
-    What nobody heard of before its sender was killed is as if it had never been, and so are the last 20 ms if
-    they are all that is not `there`.
+    Of a killed start these are the ticks up to the newest one that reached a site which is
+    present when the next start begins. Records that no member received before the kill do not
+    count, and neither do the last 20 ms if they are all that is not `there`.
     """
     starts = list(stretches(published.states[name]))
     heard = {state.tick for state in starts[-1]}
     for start, following in pairwise(starts):
-        came = [start[0].tick - 1]
+        newest_ticks = [start[0].tick - 1]
         for other, states in published.states.items():
-            place = (
+            first_unheard = (
                 [peer for peer in published.states if peer != other].index(name)
                 if other != name
                 else -1
             )
             for stretch in stretches(states) if other != name else ():
                 if stretch[-1].tick >= following[0].tick:
-                    came += [
-                        tick for state in stretch for peer, tick, _ in state.rx if peer == place
+                    newest_ticks += [
+                        tick
+                        for state in stretch
+                        for peer, tick, _ in state.rx
+                        if peer == first_unheard
                     ]
-        newest = max(tick for tick in came if tick <= start[-1].tick)
+        newest = max(tick for tick in newest_ticks if tick <= start[-1].tick)
         last = max((tick for tick in there if tick <= newest), default=-1)
         newest = last if newest - last <= SILENT_TICKS else newest
         heard |= {state.tick for state in start if state.tick <= newest}
@@ -286,14 +301,14 @@ TELEMETRY = {"late_us": 0, "busy_us": 0, "sent_ns": 0, "echo": []}
 
 
 def find_altered(published: Sequence[State], there: Sequence[State]) -> list[int]:
-    made = {state.tick: state for state in published}
-    others = [state for state in there if made.get(state.tick) != state]
+    records = {state.tick: state for state in published}
+    others = [state for state in there if records.get(state.tick) != state]
     same = msgspec.structs.replace
     return [
         state.tick
         for state in others
-        if state.tick not in made
-        or same(state, **TELEMETRY) != same(made[state.tick], **TELEMETRY)
+        if state.tick not in records
+        or same(state, **TELEMETRY) != same(records[state.tick], **TELEMETRY)
     ]
 
 

@@ -1,4 +1,4 @@
-"""One seed judged: its session is run, and again, and every invariant is looked at."""
+"""The judgement of one seed: its session is run twice, and every invariant is checked."""
 
 import gc
 import hashlib
@@ -29,16 +29,16 @@ TORQUE, AGAIN = "I6 torque", "I11 again"
 
 
 class Judged(NamedTuple):
-    """What came of a session with faults.
+    """The result of a session with faults.
 
     Attributes:
-        faults: what went wrong.
-        arms: what its arms were given.
-        violations: by invariant, in words; empty if all held.
-        visited: how often what happened: modes that were entered, events, what was dropped, how sites ended.
-        holds: ticks from the last sample that came into use to each hold.
-        steps_nm: the largest step of a torque between ticks, by mode.
-        rises_j: how much the storage rises in a tick of a hold, as `find_rises` says.
+        faults: The faults of the session.
+        arms: The settings of its arms.
+        violations: Descriptions by invariant; empty if all invariants held.
+        visited: Counts of entered modes, events, dropped messages, and ends of sites.
+        holds: Ticks from the last sample that came into use to each hold.
+        steps_nm: The largest step of a torque between ticks, by mode.
+        rises_j: Rise of the storage in a tick of a hold, as returned by `find_rises`.
     """
 
     faults: Sequence[Fault]
@@ -50,10 +50,10 @@ class Judged(NamedTuple):
     rises_j: tuple[float, float]
 
     def __str__(self) -> str:
-        found = [
+        lines = [
             f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]
         ]
-        return "\n".join([f"  {self.arms}", describe(self.faults), *found])
+        return "\n".join([f"  {self.arms}", describe(self.faults), *lines])
 
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
@@ -65,7 +65,7 @@ def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -
 
 
 def time_seed(seed: int) -> tuple[Judged, float]:
-    """Judges the faults of a seed, run twice; with what that took of a processor, s."""
+    """Judges the faults of a seed, run twice; also returns the processor time, s."""
     find_undisturbed_step()
     began_s = time.process_time()
     return judge_seed(seed), time.process_time() - began_s
@@ -83,8 +83,10 @@ def judge_faults(
     with collector_at_rest():
         with tempfile.TemporaryDirectory() as folder:
             session = run_faults(faults, Path(folder), seed, timetable, arms)
-            found = {name: list(check(session)) for name, check in INVARIANTS.items()}
-            found[TORQUE] = list(check_torque(session, undisturbed_nm))
+            violations_by_name = {
+                name: list(check(session)) for name, check in INVARIANTS.items()
+            }
+            violations_by_name[TORQUE] = list(check_torque(session, undisturbed_nm))
             digest = digest_session(session)
         if again:
             with tempfile.TemporaryDirectory() as folder:
@@ -92,8 +94,10 @@ def judge_faults(
                     digest_session(run_faults(faults, Path(folder), seed, timetable, arms))
                     != digest
                 ):
-                    found[AGAIN] = ["the same seed publishes or records other bytes"]
-        violations = {name: texts for name, texts in found.items() if texts}
+                    violations_by_name[AGAIN] = [
+                        "the same seed publishes or records other bytes"
+                    ]
+        violations = {name: texts for name, texts in violations_by_name.items() if texts}
         rises_j = [rises for _, rises in find_rises(session)] or [(-math.inf, -math.inf)]
         return Judged(
             faults,
@@ -111,7 +115,7 @@ def judge_faults(
 
 @contextmanager
 def collector_at_rest() -> Iterator[None]:
-    """As in a live site the collector of garbage does not run; then it looks at all at once."""
+    """Suspends the garbage collector, as in a live site, and collects once at the end."""
     gc.disable()
     try:
         yield
@@ -122,14 +126,14 @@ def collector_at_rest() -> Iterator[None]:
 
 @cache
 def find_undisturbed_step(timetable: Timetable = WHOLE) -> float:
-    """The largest step of a torque in the session without faults, after its first 0.1 s, N m."""
+    """Returns the largest step of a torque in the session without faults, after its first 0.1 s, N m."""
     with tempfile.TemporaryDirectory() as folder:
         undisturbed = run_faults((), Path(folder), timetable=timetable)
         return max(largest_steps(undisturbed.published, START_TICKS).values())
 
 
 def digest_session(session: FaultSession) -> str:
-    """SHA-256 of all that was published, and of the log as far as it came."""
+    """Returns the SHA-256 of all published messages, and of the log as far as it was written."""
     digest = hashlib.sha256()
     for payload in session.payloads():
         digest.update(payload)

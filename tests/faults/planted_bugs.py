@@ -1,4 +1,4 @@
-"""Bugs that are put into the program on purpose: each breaks one invariant, and the seeds must find it."""
+"""Bugs that are planted in the program: each breaks one invariant, and the seeds must find it."""
 
 import math
 import random
@@ -20,19 +20,19 @@ from .judged_seed import AGAIN, TORQUE
 
 
 def _with_setups(change: Callable[[SiteSetup], SiteSetup]) -> AbstractContextManager[Any]:
-    """Sites are built from other set-ups than their scenario says."""
+    """Sites are built from other set-ups than their scenario states."""
     begin = Site.__init__
     return mock.patch.object(Site, "__init__", lambda site, setup: begin(site, change(setup)))
 
 
 def _with_records(change: Callable[[TickRecord], TickRecord]) -> AbstractContextManager[Any]:
-    """Sites put other records out than their step has made."""
+    """Sites publish other records than their step has made."""
     step = Site.step
     return mock.patch.object(Site, "step", lambda site, inputs: change(step(site, inputs)))
 
 
 def waits_too_long() -> AbstractContextManager[Any]:
-    """A silence of 60 ms is no silence yet."""
+    """A silence of 60 ms does not yet count as silence."""
 
     def slower(setup: SiteSetup) -> SiteSetup:
         rule = setup.on_stale
@@ -52,7 +52,7 @@ def follows_at_once() -> AbstractContextManager[Any]:
 
 @contextmanager
 def jumps_back() -> Iterator[None]:
-    """Held and let go, the reference is where the peers are at once, and the torque what that asks for."""
+    """After a hold, the reference jumps to the peers at once, and the torque follows."""
 
     def faster(setup: SiteSetup) -> SiteSetup:
         unlimited = setup.limits._replace(tau_rate=(math.inf,))
@@ -75,12 +75,12 @@ def learns_the_wrong_way() -> AbstractContextManager[Any]:
 
 
 def _with_rest(change: Callable[[RestGains], RestGains]) -> AbstractContextManager[Any]:
-    """Arms come to rest in another way than follows from what is stated of them."""
+    """Arms come to rest otherwise than their stated settings imply."""
     return _with_setups(lambda setup: setup._replace(rest=change(setup.rest)))
 
 
 def feeds_what_moves() -> AbstractContextManager[Any]:
-    """Of an arm that comes to rest the brake pushes."""
+    """The brake of an arm that comes to rest pushes along the motion."""
     return _with_rest(lambda rest: rest._replace(damping=tuple(-0.1 * B for B in rest.damping)))
 
 
@@ -91,12 +91,12 @@ def _with_slower_rest(share: float) -> AbstractContextManager[Any]:
 
 
 def goes_too_far() -> AbstractContextManager[Any]:
-    """An arm comes to rest over ten times the way that it is said to take."""
+    """An arm comes to rest over ten times its stated distance."""
     return _with_slower_rest(0.1)
 
 
 def exceeds_its_limit() -> AbstractContextManager[Any]:
-    """Now and then a torque leaves without its limit."""
+    """A torque exceeds its limit now and then."""
 
     def beyond(record: TickRecord) -> TickRecord:
         return record._replace(tau=[1e4, 0.0]) if record.tick % 1500 == 1200 else record
@@ -105,7 +105,7 @@ def exceeds_its_limit() -> AbstractContextManager[Any]:
 
 
 def says_an_older_sample() -> AbstractContextManager[Any]:
-    """Now and then a record names an older sample than the one before."""
+    """A record now and then names an older sample than the record before."""
 
     def older(record: TickRecord) -> TickRecord:
         used = [max(-1, tick - 100) for tick in record.used]
@@ -115,7 +115,7 @@ def says_an_older_sample() -> AbstractContextManager[Any]:
 
 
 def never_admits_again() -> AbstractContextManager[Any]:
-    """A site that comes back stays a stranger to the others."""
+    """A site that comes back is never admitted by the others."""
     return mock.patch.object(PeerMonitor, "_decide_on_join", return_value=None)
 
 
@@ -132,7 +132,7 @@ def begins_at_zero() -> AbstractContextManager[Any]:
 
 
 def loses_records() -> AbstractContextManager[Any]:
-    """The recorder forgets a message in a thousand."""
+    """The recorder loses a message in a thousand."""
     add, count = LogParts.add, 0
 
     def forgetful(log: LogParts, *message: Any) -> Any:
@@ -144,7 +144,7 @@ def loses_records() -> AbstractContextManager[Any]:
 
 
 def depends_on_chance() -> AbstractContextManager[Any]:
-    """The order of arrivals is another one in every run."""
+    """The order of arrivals differs between equal runs."""
     drain = PeerInbox.drain
 
     def shuffled(inbox: PeerInbox, since_epoch_ns: int) -> list[Arrival]:

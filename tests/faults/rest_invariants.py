@@ -1,12 +1,15 @@
-"""What must hold of every arm that comes to rest: in `hold`, `stopped` and `fault`, whatever went wrong.
+"""Invariants of every arm that comes to rest: in `hold`, `stopped` and `fault`, under any
+faults.
 
-A rest is all that a start of a site spends in these modes, or waiting, without a tick between. Its blend is
-its first 0.15 s, in which w takes on what nobody knew of gravity (its motion is fastest after 2.5 of the
-30 ms in which B brakes), and as long after its beginning as the limit of the torque's rate binds in every
-tick: a torque that begins at zero cannot hold what hangs until it has grown to it.
+A rest is an unbroken stretch of a start of a site in these modes, or waiting. The blend of a
+rest is its first 0.15 s, in which w takes on the unknown part of gravity (its motion is fastest
+after 2.5 of the 30 ms in which B brakes). The blend also lasts as long as the limit of the
+torque's rate binds in every tick: a torque that begins at zero cannot hold a hanging arm until
+the torque has grown.
 
-In its blend as afterwards an arm may have no more energy than at the beginning but for two works, both stated
-in docs/theory/coming-to-rest.md: that of gravity which the law does not know, and that of the last torque, Eq. (5).
+In the blend and afterwards, the energy of an arm may exceed its initial energy by two works
+only, both stated in docs/theory/coming-to-rest.md: that of the gravity that the law does not
+know, and that of the last torque, Eq. (5).
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,12 +49,12 @@ class Rest(NamedTuple):
     """An arm that comes to rest.
 
     Attributes:
-        name: of its site.
-        setup: of its site, as its scenario says.
-        states: its records, the first of which begins it.
-        limited: per record, that the limit of its torque's rate, or of the torque, kept it from what it asks.
-        kinetic_j: per record.
-        blend: how many records the blend has.
+        name: Name of the site.
+        setup: Setup of the site, by its scenario.
+        states: Records of the rest, from its first one.
+        limited: Per record, True if a limit of the torque or of its rate changed the torque.
+        kinetic_j: Kinetic energy per record.
+        blend: Number of records in the blend.
     """
 
     name: str
@@ -66,7 +69,9 @@ class Rest(NamedTuple):
 
     @property
     def judged(self) -> int:
-        """The first record in a mode other than `waiting`; as many as there are if there is none."""
+        """Index of the first record in a mode other than `waiting`; the number of records
+        without any.
+        """
         return next(
             (n for n, state in enumerate(self.states) if state.mode in JUDGED), len(self.states)
         )
@@ -77,13 +82,13 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
     for name, states in session.published.states.items():
         setup, theta = session.scenario.setup(name), session.scenario.arms[name].theta
         limited = find_limited_ticks(session.scenario, name, states)
-        place = 0
+        first_row = 0
         for (_, resting), group in groupby(
             states, key=lambda at: (at.boot, at.mode in RESTING)
         ):
             rows = list(group)
-            of = slice(place, place + len(rows))
-            place = of.stop
+            of = slice(first_row, first_row + len(rows))
+            first_row = of.stop
             if resting:
                 q, qd = (
                     np.array([getattr(state, key) for state in rows]) for key in ("q", "qd")
@@ -95,9 +100,11 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
 
 
 def find_limited_ticks(scenario: Scenario, name: str, states: Sequence[State]) -> np.ndarray:
-    """True for every record whose torque, or that before, is at its limit or at that of its rate.
+    """Returns True for every record whose torque, or the one before, is at a limit of torque or
+    rate.
 
-    Over the period after a record the arm feels both of them (Eq. (8), extrapolated to mid-period).
+    Over the period after a record the arm feels both torques (Eq. (8), extrapolated to
+    mid-period).
     """
     setup = scenario.setup(name)
     most = np.asarray(setup.limits.tau_rate) / setup.rate_hz * (1.0 - RESIDUAL)
@@ -107,14 +114,14 @@ def find_limited_ticks(scenario: Scenario, name: str, states: Sequence[State]) -
     # of a fast arm the torque is not that of its law
     qd = np.array([state.qd for state in states])
     limited |= np.any(np.abs(qd) * setup.rest.damping > setup.tau_limit_nm, axis=1)
-    found: np.ndarray = limited | np.r_[False, limited[:-1]]
-    return found
+    limited_ticks: np.ndarray = limited | np.r_[False, limited[:-1]]
+    return limited_ticks
 
 
 def check_storage(session: FaultSession) -> Iterator[str]:
     """I5: at rest the storage of the adaptive law, with that of its integral, never rises.
 
-    While its reference comes to rest, by no more than what that works.
+    While the reference comes to rest, the storage rises by no more than the reference's work.
     """
     for name, (at_rest_j, before_j) in find_rises(session):
         if at_rest_j > RESIDUAL:
@@ -124,11 +131,13 @@ def check_storage(session: FaultSession) -> Iterator[str]:
 
 
 def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]]]:
-    """How much the storage rises in a tick of every rest: its reference at rest, and before that, J.
+    """Yields the rise of the storage per tick of every rest: with the reference at rest, and
+    before, J.
 
-    Before, beyond the work of its reference, (Kd qd + B r + w)'qd_des. Both are relative to the
-    largest storage in it, where that is more than 1 J. Ticks in which a limit keeps the torque from being
-    that of the law say nothing of the law.
+    The second number is the rise beyond the work of the reference, (Kd qd + B r + w)'qd_des.
+    Both are relative to the largest storage of the rest, if that exceeds 1 J. Ticks in which a
+    limit keeps the torque from being that of the law are left out, because they say nothing of
+    the law.
     """
     for rest in find_rests(session):
         if len(rest.states) < 3:
@@ -160,16 +169,19 @@ def read_next_w(rest: Rest) -> np.ndarray:
 
 
 def _or_tick_before(marks: np.ndarray) -> np.ndarray:
-    """Returns True for each tick but the first that is marked itself, or whose predecessor is."""
+    """Returns True for each tick, except the first, that is marked or whose predecessor is
+    marked.
+    """
     either: np.ndarray = marks[1:] | marks[:-1]
     return either
 
 
 def find_limited_law(rest: Rest) -> np.ndarray:
-    """True for every tick in which, or in the tick before which, the law's own torque is at its limit.
+    """Returns True for every tick in which, or just before which, the law's own torque is at
+    its limit.
 
-    The torque of a record is limit(law) + w - B s: the sum can be within the limit while the law's part,
-    of an estimate that is too large, is not.
+    The torque of a record is limit(law) + w - B s. The sum can be within the limit although the
+    law's part, computed from an estimate that is too large, is not.
     """
     gains, still = rest.setup.gains, rest.setup.rest
     assert still is not None
@@ -184,7 +196,9 @@ def find_limited_law(rest: Rest) -> np.ndarray:
 
 
 def find_given_up(rest: Rest) -> np.ndarray:
-    """True for every tick whose w may lose more than its rule of rest says, because the arm still brakes."""
+    """Returns True for every tick whose w may fall faster than by its rule of rest, as the arm
+    still brakes.
+    """
     w = read_next_w(rest)
     with_motion = (w[:-1] * rest.rows("qd")[1:] > 0.0).any(axis=1)
     braking = np.arange(1, len(w)) <= LEAST_STOP_S * rest.setup.rate_hz + 1
@@ -193,10 +207,12 @@ def find_given_up(rest: Rest) -> np.ndarray:
 
 
 def compute_storage(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndarray]:
-    """V = 1/2 (r'M r + e'Lambda Kd e + theta~'Gamma^-1 theta~ + w'(k B)^-1 w) but for the first record, J.
+    """Returns V = 1/2 (r'M r + e'Lambda Kd e + theta~'Gamma^-1 theta~ + w'(k B)^-1 w) without
+    the first record, J.
 
-    Of w the memory of a record has that of the next one. Less 1/2 h w's: w goes on by Euler's rule, whose
-    own storage is that. With it comes the power of the reference, (Kd qd + B r + w)'qd_des, W.
+    The memory of a record holds w of the next one. The storage of Euler's rule, by which w
+    advances, is less by 1/2 h w's. Also returns the power of the reference, (Kd qd + B r +
+    w)'qd_des, W.
     """
     gains, theta, still = rest.setup.gains, scenario.arms[rest.name].theta, rest.setup.rest
     assert still is not None
@@ -216,9 +232,9 @@ def compute_storage(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndar
 
 
 def check_energy(session: FaultSession) -> Iterator[str]:
-    """I12: the kinetic energy is at most 1.05 times that at the beginning.
+    """I12: the kinetic energy is at most 1.05 times that at the beginning, plus two works.
 
-    Besides there is the work of gravity that the law does not know, and that of the last torque.
+    These are the work of the gravity that the law does not know, and that of the last torque.
     """
     for rest in find_rests(session):
         first = rest.judged
@@ -236,7 +252,7 @@ def check_energy(session: FaultSession) -> Iterator[str]:
 
 
 def _find_gravity(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndarray]:
-    """G, and that of the estimate, rows of records, N m."""
+    """Returns G, and G by the estimate, rows of records, N m."""
     arm = PlanarArmRows(scenario.arms[rest.name].theta, rest.setup.g_m_s2, (1.0, 1.0))
     q, known = rest.rows("q"), rest.rows("theta_hat")
     still = np.zeros_like(q)
@@ -247,9 +263,11 @@ def _find_gravity(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndarra
 
 
 def find_gravity_work(scenario: Scenario, rest: Rest) -> np.ndarray:
-    """The most work until each record of the gravity that the law does not know, J.
+    """Returns the largest work, until each record, of the gravity that the law does not know,
+    J.
 
-    The arm may have it twice: w takes on what was missing while the joint falls, and gives it back.
+    The arm may have this work twice: w takes on the missing torque while the joint falls, and
+    returns it.
     """
     G, known = _find_gravity(scenario, rest)
     power = ((known - G) * rest.rows("qd")).sum(axis=1)
@@ -259,7 +277,9 @@ def find_gravity_work(scenario: Scenario, rest: Rest) -> np.ndarray:
 
 
 def find_blend_work(scenario: Scenario, rest: Rest) -> float:
-    """Eq. (5): what the last torque beyond known gravity may add while it is taken away, J."""
+    """Returns the energy that the last torque beyond known gravity may add while it decays, Eq.
+    (5), J.
+    """
     _, known = _find_gravity(scenario, rest)
     beyond_nm = np.abs(rest.rows("tau")[0] - known[0])
     return float(
@@ -268,9 +288,11 @@ def find_blend_work(scenario: Scenario, rest: Rest) -> float:
 
 
 def check_speed(session: FaultSession) -> Iterator[str]:
-    """I15: no joint is faster than 1.1 times the fastest at the beginning, plus the rise during the blend.
+    """I15: no joint exceeds 1.1 times the largest initial speed, plus the rise during the
+    blend.
 
-    That is D / B, D the largest torque that nothing balances during the blend: M times the acceleration.
+    The rise is D / B, where D is the largest unbalanced torque in the blend: M times the
+    acceleration.
     """
     for rest in find_rests(session):
         speed = np.abs(rest.rows("qd")).max(axis=1)
@@ -281,23 +303,25 @@ def check_speed(session: FaultSession) -> Iterator[str]:
 
 
 def find_rise(scenario: Scenario, rest: Rest) -> float:
-    """The rise of the speed during the blend, D / B of the joint where it is largest, rad/s."""
+    """Returns the rise of the speed during the blend, D / B of the joint where it is largest,
+    rad/s.
+    """
     return float((_find_unbalanced(scenario, rest) / np.asarray(rest.setup.rest.damping)).max())
 
 
 def _find_unbalanced(scenario: Scenario, rest: Rest) -> np.ndarray:
-    """The largest M times acceleration of each joint during the blend, N m."""
+    """Returns the largest M times acceleration of each joint during the blend, N m."""
     q, v = (rest.rows(key)[: rest.blend + 1] for key in ("q", "qd"))
     a = np.diff(v, axis=0) * rest.setup.rate_hz
     torque = np.abs(_multiply_inertia(scenario.arms[rest.name].theta, q[1:], a))
-    found: np.ndarray = torque.max(axis=0, initial=0.0)
-    return found
+    largest_nm: np.ndarray = torque.max(axis=0, initial=0.0)
+    return largest_nm
 
 
 def check_rest(session: FaultSession) -> Iterator[str]:
-    """I13: within the time that `scenario check` states an arm is at rest, and stays so.
+    """I13: an arm is at rest within the time that `scenario check` states, and stays at rest.
 
-    A blend that is longer than 0.15 s, because the limit of the torque's rate binds, is added.
+    A blend beyond 0.15 s, which the limit of the torque's rate causes, is added to that time.
     """
     for rest in find_rests(session):
         stated_s = find_rest_bounds(session.scenario, rest.name).rest_s
@@ -310,7 +334,7 @@ def check_rest(session: FaultSession) -> Iterator[str]:
 
 
 def check_travel(session: FaultSession) -> Iterator[str]:
-    """I14: from its blend's end an arm is no farther from its beginning than its stopping distance."""
+    """I14: after its blend an arm stays within its stopping distance of its beginning."""
     for rest in find_rests(session):
         q = rest.rows("q")
         travel = np.abs(q - q[0]).max(axis=1)
@@ -322,10 +346,11 @@ def check_travel(session: FaultSession) -> Iterator[str]:
 
 
 def find_stopping_distance(scenario: Scenario, rest: Rest) -> float:
-    """How far a joint goes until all rest: its reference, and what its torque takes it besides, rad.
+    """Returns the distance of each joint until all rest, by the reference and by its torque,
+    rad.
 
-    The reference goes |v| T / 2. A torque d that nothing balances as it begins, M times the acceleration
-    that is seen, is taken on by w while s adds up to d / (k B) = 4 time_s d / B.
+    The reference moves by |v| T / 2. An initially unbalanced torque d, M times the observed
+    acceleration, is taken on by w while s adds up to d / (k B) = 4 time_s d / B.
     """
     still = rest.setup.rest
     assert still is not None

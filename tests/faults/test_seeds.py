@@ -1,4 +1,4 @@
-"""Whole sessions in which things go wrong by a seed, on virtual time, over the code that runs live."""
+"""Whole sessions with faults drawn from a seed, in virtual time, over the code that runs live."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ FINDS_WITHIN = 200
 
 
 @pytest.mark.parametrize("first", range(0, ON_PUSH, 3))
-def test_invariants_hold_whatever_goes_wrong(first: int) -> None:
-    """Six seeds on a push, in short sessions that nobody leaves, one of them twice.
+def test_invariants_hold_in_short_faulty_sessions(first: int) -> None:
+    """Six seeds on a push, in short sessions that no member leaves, one of them twice.
 
-    Kills and returns are those of tests/sites/test_leaving.py, and of the long seeds.
+    Kills and returns are covered by tests/sites/test_leaving.py, and by the long seeds.
     """
     for seed in range(first, first + 3):
         assert_holds(judge_seed(seed, again=seed == 0, timetable=SHORT))
@@ -30,13 +30,13 @@ def test_invariants_hold_in_a_hundred_whole_sessions() -> None:
     """`make faults` judges two thousand, in hours of processor time."""
     visited: Counter[str] = Counter()
     for seed in range(100):
-        judged = judge_seed(seed)
-        assert_holds(judged)
-        visited += judged.visited
+        judged_seed = judge_seed(seed)
+        assert_holds(judged_seed)
+        visited += judged_seed.visited
     assert not set(SOMETIMES) - set(visited)
 
 
-def test_site_tells_peer_that_was_cut_off_as_it_came() -> None:
+def test_sites_report_a_cut_off_peer() -> None:
     cut, end = (
         Fault("cut", 0.571, 1.2286, ("m2", "m1"), 0.0),
         Fault("end", 1.453, 0.01, ("m2",), 0.0),
@@ -82,7 +82,7 @@ def faults_of(kind: str) -> st.SearchStrategy[Fault]:
 
 
 def draw_of(kind: str) -> tuple[str, ...]:
-    """Whom a kind befalls, for once."""
+    """Returns the sites that a kind of fault befalls, once."""
     return next(
         fault.of for seed in range(10_000) for fault in draw_faults(seed) if fault.kind == kind
     )
@@ -91,6 +91,6 @@ def draw_of(kind: str) -> tuple[str, ...]:
 @pytest.mark.long
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.lists(st.sampled_from(sorted(KINDS)).flatmap(faults_of), max_size=5))
-def test_any_faults_at_all(faults: Sequence[Fault]) -> None:
-    """Hypothesis makes those that fail small."""
+def test_any_drawn_faults_keep_the_invariants(faults: Sequence[Fault]) -> None:
+    """Hypothesis shrinks failing faults."""
     assert_holds(judge_faults(sorted(faults, key=lambda fault: fault.at_s)))

@@ -19,7 +19,7 @@ from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
-from trilat_net.scenario.code_consent import allow_own_code
+from trilat_net.own_code.code_consent import allow_own_code
 
 PAPER = ("m1", "m2", "s")
 BEGUN = "the session begins"

@@ -25,7 +25,7 @@ timeline=[
 
 
 @pytest.mark.long
-def test_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage) -> None:
+def test_ten_timed_changes_are_executed_again_exactly(stage: Stage) -> None:
     """With a stale peer at the end, that a site holds for."""
     options = (
         "--set",
@@ -46,7 +46,7 @@ def test_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage
 
 
 @pytest.mark.long
-def test_changes_of_a_running_session_are_answered_recorded_and_reproduced(
+def test_changes_in_a_session_are_answered_and_reproduced(
     stage: Stage,
 ) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "6")
@@ -71,7 +71,7 @@ def test_changes_of_a_running_session_are_answered_recorded_and_reproduced(
 
 
 @pytest.mark.long
-def test_python_changes_stops_measures_and_ends_session_as_commands_do(stage: Stage) -> None:
+def test_python_and_commands_change_sessions_alike(stage: Stage) -> None:
     glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
     running = Session(stage, "paper", PAPER, "--duration", "60", *glide)
     running.all()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.cli.running import trilat
-from tests.truth import judged, members, offset_errors
+from tests.truth import judge_link, members, offset_errors
 
 from .processes import PAPER, Session, Stage, connections
 
@@ -24,7 +24,7 @@ IDLE_US = 200.0
 
 
 @pytest.mark.long
-def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> None:
+def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "12")
     session.recorder(*SKEWS["recorder"])
     for name in ("s", "m2", "m1"):  # the leader comes last
@@ -36,7 +36,7 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
     log = session.is_reproduced()
     for site in PAPER:
         for peer in log.scenario.peers(site):
-            samples = judged(log, site, peer)
+            samples = judge_link(log, site, peer)
             assert len(samples.tick) > 6_000
             assert samples.inside >= 0.999
             assert samples.delay_us.min() > 0.0
@@ -67,7 +67,7 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
 
 
 @pytest.mark.long
-def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage) -> None:
+def test_waiting_sessions_answer_pings_without_joining(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
     waiting = session.site("s")
     waiting.prints("waiting for")
@@ -80,7 +80,7 @@ def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage
     session.ends_well()
 
 
-def test_a_ping_that_nobody_answers_says_where_it_looked(stage: Stage) -> None:
+def test_unanswered_pings_say_where_they_looked(stage: Stage) -> None:
     done = trilat("ping", "--session", "nobody-here", "--timeout", "0.5", cwd=stage.folder)
     done.refuses(
         "no site of session 'nobody-here' answered at tcp/127.0.0.1:", "--connect", code=1

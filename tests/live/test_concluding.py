@@ -19,7 +19,7 @@ from .processes import Session, Stage
 
 
 @pytest.mark.long
-def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None:
+def test_a_good_log_is_verified_and_reported(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5", "--stay", "60")
     session.recorder("--conclude")
     for name in session.sites:
@@ -34,7 +34,7 @@ def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None
 
 
 @pytest.mark.long
-def test_a_run_that_diverged_fails_though_its_log_is_sound(
+def test_a_diverged_run_fails_despite_sound_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def recorded(storage: LogStorage, afterwards: Callable[[], None], **_others: object) -> int:

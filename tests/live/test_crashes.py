@@ -18,9 +18,7 @@ from .small_disks import NoSmallDisk, SmallDisk, small_disk
 
 @pytest.mark.parametrize("durable", [False, True])
 @pytest.mark.long
-def test_recorder_that_is_killed_leaves_all_that_it_had_flushed(
-    durable: bool, stage: Stage
-) -> None:
+def test_a_killed_recorder_keeps_all_flushed_messages(durable: bool, stage: Stage) -> None:
     done = killed(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
     assert done.recovery.lossless, done.recovery.lost
     assert done.kept == done.flushed
@@ -32,7 +30,7 @@ def test_recorder_that_is_killed_leaves_all_that_it_had_flushed(
 
 
 @pytest.mark.long
-def test_a_full_disk_ends_recording_and_no_site_loses_samples(stage: Stage) -> None:
+def test_a_full_disk_ends_recording_without_harm(stage: Stage) -> None:
     folder = stage.folder / "disk"
     folder.mkdir()
     try:

@@ -54,7 +54,7 @@ def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
     assert [event.about for event in log.events if event.kind == "lost"] == ["s"]
 
 
-def test_ctrl_c_during_run_ends_all_and_finishes_file(stage: Stage) -> None:
+def test_ctrl_c_ends_everything_and_finishes_file(stage: Stage) -> None:
     running = demo(stage)
     log_file = recording(stage)
     children = running.children()
@@ -76,9 +76,7 @@ def test_ctrl_c_during_run_ends_all_and_finishes_file(stage: Stage) -> None:
         pytest.param(signal.SIGINT, "", id="before any child", marks=pytest.mark.long),
     ],
 )
-def test_signal_before_session_begins_ends_all_and_leaves_no_log(
-    number: int, when: str, stage: Stage
-) -> None:
+def test_signals_before_sessions_leave_no_log(number: int, when: str, stage: Stage) -> None:
     running = demo(stage)
     running.prints("s live: ")
     if when:
@@ -90,7 +88,7 @@ def test_signal_before_session_begins_ends_all_and_leaves_no_log(
     assert not (stage.folder / "out" / "run.mcap").exists()
 
 
-def test_a_demo_bears_its_scenarios_name_and_shows_errors(stage: Stage) -> None:
+def test_demos_bear_their_scenarios_name_and_errors(stage: Stage) -> None:
     """So `tn.hand("play", "m1")` finds it, as sites that are started one by one."""
     running = stage.start(
         "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
@@ -106,7 +104,7 @@ def test_a_demo_bears_its_scenarios_name_and_shows_errors(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_ctrl_c_while_drawing_is_130_and_leaves_the_log(stage: Stage) -> None:
+def test_ctrl_c_while_drawing_keeps_the_log(stage: Stage) -> None:
     running = demo(stage, duration="0.5")
     running.prints("checking the log and drawing")
     children = running.children()

@@ -89,7 +89,7 @@ def find_recorder(demo: Process) -> int:
 
 @pytest.mark.long
 @pytest.mark.parametrize("moment", range(40))
-def test_ctrl_c_while_the_recorder_is_frozen_loses_nothing(moment: int, stage: Stage) -> None:
+def test_ctrl_c_with_frozen_recorder_loses_nothing(moment: int, stage: Stage) -> None:
     freeze = Freeze(random.Random(5300 + moment))
     interrupt = interrupt_demo if moment % 2 else interrupt_members
     log, made = interrupt(stage, freeze)
@@ -99,7 +99,7 @@ def test_ctrl_c_while_the_recorder_is_frozen_loses_nothing(moment: int, stage: S
 
 
 @pytest.mark.long
-def test_a_second_ctrl_c_ends_at_once_and_the_log_says_so(stage: Stage) -> None:
+def test_a_second_ctrl_c_ends_logs_openly(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "60")
     session.all()
     session.recording()

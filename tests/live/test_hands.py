@@ -92,14 +92,14 @@ SHARES = ("dominance", "s", "m1=0.8", "m2=0.2", "--ramp", "1s")
 
 
 @pytest.mark.long
-def test_session_of_two_programs_and_changes_is_verified_and_repeated(stage: Stage) -> None:
+def test_sessions_of_two_programs_verify_and_repeat(stage: Stage) -> None:
     log = held(Session(stage, "play", PAPER, "--duration", "6"), 2.5, [DELAY, SHARES])
     assert [len(log.changes(name)) for name in PAPER] == [0, 0, 2]
 
 
 @needs_browser
 @pytest.mark.long
-def test_a_minute_of_hands_and_changes_is_verified_and_repeated(stage: Stage) -> None:
+def test_a_minute_of_hands_verifies_and_repeats(stage: Stage) -> None:
     """The certificate books what the hands gave: V never rises by more.
 
     At 500 Hz two processors have room for the page too, in a browser that draws by software.
@@ -131,9 +131,7 @@ SHARED = (0.9, 0.1, 0.7, 0.5)
 
 
 @pytest.mark.long
-def test_program_that_is_killed_in_grip_leaves_no_force_behind(
-    stage: Stage, tmp_path: Path
-) -> None:
+def test_a_killed_program_leaves_no_force(stage: Stage, tmp_path: Path) -> None:
     """By the log: from its last message to the last force, and the event that says so."""
     session = Session(stage, "play", PAPER, "--duration", "15")
     session.all()
@@ -147,7 +145,7 @@ def test_program_that_is_killed_in_grip_leaves_no_force_behind(
 
 
 @pytest.mark.long
-def test_a_program_cut_off_in_grip_leaves_no_force(
+def test_a_program_cut_off_leaves_no_force(
     stage: Stage, tmp_path: Path, apart: Machines
 ) -> None:
     """The session is on one machine, the program on another; no tick is missing because of the cut."""

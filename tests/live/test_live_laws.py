@@ -88,7 +88,7 @@ def test_four_channels_transmit_through_20_ms(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("law", [*LAWS, *STORED])
-def test_live_run_of_every_law_is_executed_again_to_bit(law: str, stage: Stage) -> None:
+def test_live_laws_are_executed_again_exactly(law: str, stage: Stage) -> None:
     scenario, changes = LAWS.get(law, ("two_sites", {"scheme": "digital"}))
     changes = {**changes, "duration_s": 2.0, "link.delay_ms": 20.0, "control.law": law}
     changes |= {f"sites.s.control.{key}": value for key, value in STORED.get(law, {}).items()}

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.truth import Member, again, judged, members, offset_errors
+from tests.truth import Member, again, judge_link, members, offset_errors
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
@@ -44,7 +44,7 @@ def clocks_as_injected(log: Log) -> None:
         assert clocks[name].offset_ns == offset_s * 1e9
         assert float(clocks[name].rate - 1) * 1e6 == pytest.approx(drift_ppm)
     for site, peer in pairs(PAPER):
-        link = judged(log, site, peer)
+        link = judge_link(log, site, peer)
         assert link.inside >= 0.999
         assert link.tick.size >= 0.5 * len(log[site])
         assert link.delay_us.min() > 0.0
@@ -73,9 +73,7 @@ def test_three_machines_in_any_order_of_starts(
 
 
 @pytest.mark.long
-def test_machines_that_cannot_reach_each_other_meet_at_a_router(
-    stage: Stage, apart: Machines
-) -> None:
+def test_unreachable_machines_meet_at_a_router(stage: Stage, apart: Machines) -> None:
     starred(apart, "centre", ALL)
     assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
     assert not any(reaches(apart, one, apart.address[other]) for one, other in pairs(ALL))
@@ -120,7 +118,7 @@ def heard(log: Log, site: str, peer: str) -> Heard:
 
 
 @pytest.mark.long
-def test_way_that_is_cut_heals_and_loops_never_stop(stage: Stage, apart: Machines) -> None:
+def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None:
     """Once for less than Zenoh's lease, so that what waited comes in a burst, and once for longer.
 
     One direction measures, the other delays by 200 ms.
@@ -156,9 +154,7 @@ def test_way_that_is_cut_heals_and_loops_never_stop(stage: Stage, apart: Machine
 
 
 @pytest.mark.long
-def test_separate_machines_hold_during_a_cut_and_return_after_kills(
-    stage: Stage, apart: Machines
-) -> None:
+def test_machines_hold_during_cuts_and_return(stage: Stage, apart: Machines) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
     bridged(apart, ALL)
     session = Apart.following(stage, apart, 40)
@@ -189,7 +185,7 @@ def test_separate_machines_hold_during_a_cut_and_return_after_kills(
 
 
 @pytest.mark.long
-def test_a_one_way_cut_is_held_at_both_ends(stage: Stage, apart: Machines) -> None:
+def test_one_way_cuts_hold_both_ends(stage: Stage, apart: Machines) -> None:
     """Packets of m1 reach m2 no more, those of m2 go on: for less than Zenoh's lease, and for longer.
 
     m2 holds at once. Nor do TCP's acknowledgements reach it: what it sends goes on for 0.1 to 0.2 s, until

@@ -38,9 +38,7 @@ class Law(Adaptive):
 
 
 @pytest.mark.long
-def test_law_that_is_too_slow_ends_session_in_order(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_laws_end_sessions_in_order(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     (stage.folder / "slow_law.py").write_text(SLOW)
     monkeypatch.chdir(stage.folder)
     law = ("--set", "sites.s.control.law=slow_law:Law")
@@ -62,7 +60,7 @@ def test_law_that_is_too_slow_ends_session_in_order(
     executed_again(log)
 
 
-def test_a_foreign_arm_joins_a_session_of_two_sites(stage: Stage) -> None:
+def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
     """All with a law that is none of ours either, and that sends to all and to each."""
     options = (*OUTSIDE, *TALKING, "--duration", "4", "--set", "rate_hz=250")
     session = Session(stage, "paper", ("m1", "m2", "s"), *options)
@@ -102,7 +100,7 @@ def drive_arm(session: Session, scenario: str, *options: str) -> str:
 
 
 @pytest.mark.long
-def test_seven_measured_joints_run_after_six_were_refused(stage: Stage) -> None:
+def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
     """The wrong arm goes on sending until it is ended; the right one may begin where it did not."""
     next(execute_virtual(load_scenario("seven_joints")))  # compiles, once for all processes
     options = (*OUTSIDE, "--duration", "3")

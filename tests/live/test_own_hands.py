@@ -74,7 +74,7 @@ def test_a_person_takes_over_from_a_running_program(
 
 
 @pytest.mark.long
-def test_a_killed_program_lets_go_and_the_others_go_on(
+def test_a_killed_program_lets_go_without_harm(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """SIGKILL in the middle: silence of 200 ms, a grip that fades within 100 ms, no site that holds."""

@@ -48,7 +48,7 @@ def from_the_start(path: Path) -> Log:
 
 
 @pytest.mark.long
-def test_a_frozen_recorder_has_every_record_in_the_end(stage: Stage) -> None:
+def test_frozen_recorders_finally_have_every_record(stage: Stage) -> None:
     """With small buffers on the way, so that the network drops what it cannot deliver."""
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "7")
     session.endpoints = [

@@ -49,7 +49,7 @@ def numbered(log: Path) -> dict[str, list[bytes]]:
 
 
 @pytest.mark.parametrize("live", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_a_replayed_and_recorded_log_is_the_same_bytes(live: bool, stage: Stage) -> None:
+def test_replayed_and_recorded_logs_are_equal_bytewise(live: bool, stage: Stage) -> None:
     path = virtual_log(stage.folder)
     if live:
         session = Session(stage, "two_sites", ("m", "s"), "--duration", "1.5")
@@ -75,7 +75,7 @@ def virtual_log(folder: Path) -> Path:
 
 
 @pytest.mark.long
-def test_a_latecomer_to_a_replay_gets_all_of_it(stage: Stage) -> None:
+def test_latecomers_to_a_replay_get_everything(stage: Stage) -> None:
     """Round after round, so that nobody is too late; until Ctrl-C."""
     path = virtual_log(stage.folder)
     again = Again(stage, path)
@@ -111,7 +111,7 @@ def test_a_fast_replay_to_another_process_loses_nothing(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_log_in_which_site_began_anew_is_played_whole(stage: Stage) -> None:
+def test_logs_of_restarted_sites_are_played_whole(stage: Stage) -> None:
     """Each start numbers its events from 0; they are played start after start, and none is lost."""
     session = Sites.whole(gliding(5.0), stage.folder, ends={})
     session.clocks["m"].dies_ns = 3_000_000_000

@@ -24,7 +24,7 @@ LINKS = (
 
 
 @pytest.mark.long
-def test_any_sites_of_a_session_are_what_they_were(stage: Stage) -> None:
+def test_rerun_sites_of_a_session_are_unchanged(stage: Stage) -> None:
     """Late samples, losses, duplicates, an outage, a stale peer, a measured link, and a change by command."""
     options = [word for text in LINKS for word in ("--set", text)]
     session = Session(stage, "paper", PAPER, "--duration", "4", *options)

@@ -51,7 +51,7 @@ def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Sess
 
 @pytest.mark.long
 @pytest.mark.parametrize("victims", [("m1", "s", "m1")])
-def test_a_killed_site_started_again_follows_within_two_seconds(
+def test_restarted_sites_follow_within_two_seconds(
     victims: Sequence[str], stage: Stage
 ) -> None:
     session, log = killed_and_started_again(stage, victims)
@@ -75,7 +75,7 @@ def test_a_killed_site_started_again_follows_within_two_seconds(
 
 
 @pytest.mark.long
-def test_a_site_that_hangs_up_is_named_by_the_others(stage: Stage) -> None:
+def test_leaving_sites_are_named_by_the_others(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "6", *GLIDE)
     session.all()
     session.begun()

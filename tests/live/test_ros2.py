@@ -158,7 +158,7 @@ def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, An
 
 
 @pytest.mark.long
-def test_a_stranger_leads_and_stops_an_arm_and_verifies(stage: Stage) -> None:
+def test_strangers_lead_and_stop_arms_and_verify(stage: Stage) -> None:
     with bridged_session(stage, 25) as (session, bridge, ros):
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for n in range(150):
@@ -200,7 +200,7 @@ def test_a_stranger_leads_and_stops_an_arm_and_verifies(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
+def test_a_killed_bridge_leaves_no_force(stage: Stage) -> None:
     with bridged_session(stage, 15) as (session, bridge, ros):
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for _ in range(60):
@@ -216,7 +216,7 @@ def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_router_that_comes_late_is_joined_and_latecomers_see(stage: Stage) -> None:
+def test_late_routers_are_joined_and_latecomers_see(stage: Stage) -> None:
     (router,) = find_free_endpoints(1)
     session = Session(stage, "play", PAPER, "--duration", "120", *SLOWER)
     session.all()
@@ -265,7 +265,7 @@ SAFE = [-0.25, 0.25]
 
 
 @pytest.mark.long
-def test_a_robot_of_ros_brakes_when_its_site_is_silent(stage: Stage) -> None:
+def test_ros_robots_brake_when_their_site_is_silent(stage: Stage) -> None:
     (router,) = find_free_endpoints(1)
     running = stage.start("router", "router", "--listen", router)
     (stage.folder / "robot.toml").write_text(ROBOT)

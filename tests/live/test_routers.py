@@ -62,7 +62,7 @@ def test_sites_with_keys_that_meet_without_a_router(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) -> None:
+def test_sessions_run_over_mutual_tls(stage: Stage) -> None:
     own = Certificates(stage.folder).zenoh_file()
     session = Routed(stage, "1", "tls", "--zenoh-config", str(own))
     router = session.router()
@@ -73,7 +73,7 @@ def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) ->
 
 
 @pytest.mark.long
-def test_router_that_is_killed_and_started_again_heals_session(stage: Stage) -> None:
+def test_sessions_heal_when_killed_routers_return(stage: Stage) -> None:
     """The loops never stop; what was made meanwhile comes into the log from the sites' memory."""
     session = Keyed(stage, "8")
     router = session.router()
@@ -104,7 +104,7 @@ def test_router_that_is_killed_and_started_again_heals_session(stage: Stage) -> 
 
 
 @pytest.mark.long
-def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> None:
+def test_all_may_stop_but_only_operators_enable(stage: Stage) -> None:
     glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
     # an operator ends it long before that
     session = Session(stage, "two_sites", SITES, "--duration", "600", *glide)

@@ -30,9 +30,7 @@ from .processes import (
 
 @pytest.mark.long  # on a push `make live` does the same with the commands
 @pytest.mark.parametrize("law", [(), TALKING], ids=["its law", "a law that sends"])
-def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(
-    law: tuple[str, ...], stage: Stage
-) -> None:
+def test_live_paper_experiment_equals_virtual_time(law: tuple[str, ...], stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "3", *law)
     session.all()
     log = session.is_reproduced()
@@ -51,7 +49,7 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(
 @pytest.mark.parametrize(
     ("scenario", "duration_s"), [("six_joints", 3), ("seven_joints", 20), ("unlike_arms", 5)]
 )
-def test_arms_of_many_joints_live_are_virtual_time(
+def test_live_arms_of_many_joints_equal_virtual_time(
     scenario: str, duration_s: int, stage: Stage
 ) -> None:
     for name in ("m1", "s"):  # compiled once for all sites of as many joints
@@ -63,7 +61,7 @@ def test_arms_of_many_joints_live_are_virtual_time(
 
 
 @pytest.mark.long
-def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> None:
+def test_garbage_is_counted_and_changes_nothing(stage: Stage) -> None:
     """With the `digital` scheme and a leader that comes last; and a second m1 is refused meanwhile."""
     session = Session(stage, "paper", PAPER, "--duration", "16", "--set", 'scheme="digital"')
     session.all("recorder", "s", "m2", "m1")
@@ -116,7 +114,7 @@ def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> N
 
 
 @pytest.mark.long
-def test_a_frozen_site_on_slow_links_loses_no_bit(stage: Stage) -> None:
+def test_frozen_sites_on_slow_links_keep_bits(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "3", "--set", "link.delay_ms=2000")
     session.all()
     session.recording()
@@ -130,7 +128,7 @@ def test_a_frozen_site_on_slow_links_loses_no_bit(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_needed_recorder_that_comes_last_is_waited_for(stage: Stage) -> None:
+def test_needed_recorders_may_come_last(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
     for name in ("s", "m", "recorder"):
         session.all(name)
@@ -166,7 +164,7 @@ def test_two_sessions_without_endpoints_do_not_meet(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_an_interrupted_recorder_finishes_its_file_and_sites_continue(stage: Stage) -> None:
+def test_interrupted_recorders_finish_files_and_sites_continue(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "2")
     session.all()
     recorder = session.processes["recorder"]
@@ -183,7 +181,7 @@ def test_an_interrupted_recorder_finishes_its_file_and_sites_continue(stage: Sta
 
 
 @pytest.mark.long
-def test_site_that_leaves_its_limits_ends_session_and_says_so(stage: Stage) -> None:
+def test_sites_leaving_limits_end_sessions_openly(stage: Stage) -> None:
     session = Session(
         stage, "paper", PAPER, "--set", "limits.qd_limit_rad_s=0.5", "--duration", "10"
     )
@@ -201,7 +199,7 @@ def test_site_that_leaves_its_limits_ends_session_and_says_so(stage: Stage) -> N
 
 
 @pytest.mark.long
-def test_waiting_in_vain_names_the_missing_and_leaves_no_file(stage: Stage) -> None:
+def test_waiting_in_vain_names_the_missing(stage: Stage) -> None:
     site = Session(stage, "paper", PAPER).site("m2", "--join-timeout", "1")
     apart = Session(stage, "paper", PAPER)
     recorder = apart.recorder("--join-timeout", "1")

@@ -48,7 +48,7 @@ def delays_ms(log: Log, site: str, peer: str) -> NDArray[np.float64]:
 
 
 @pytest.mark.long
-def test_sites_hold_while_a_delay_is_too_long_then_follow(
+def test_sites_hold_during_long_delays_then_follow(
     queue: str, stage: Stage, apart: Machines
 ) -> None:
     """All that m1 sends comes later and later, or 0.4 s later; then what waits comes at once."""
@@ -71,7 +71,7 @@ def test_sites_hold_while_a_delay_is_too_long_then_follow(
 
 
 @pytest.mark.long
-def test_jitter_within_the_delay_of_the_links_changes_no_record(
+def test_jitter_within_the_delay_changes_no_record(
     queue: str, stage: Stage, apart: Machines
 ) -> None:
     """What m1 sends waits for moments, some tens of milliseconds; the session is that of virtual time."""

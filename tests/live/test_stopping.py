@@ -79,9 +79,7 @@ def enabled(stage: Stage, page: PageClient) -> None:
 
 
 @pytest.mark.parametrize("scenario", HELD)
-def test_every_held_arm_is_stopped_from_everywhere_and_follows_again(
-    scenario: str, stage: Stage
-) -> None:
+def test_every_arm_stops_from_everywhere_and_returns(scenario: str, stage: Stage) -> None:
     running = live(stage, scenario)
     with page_client(page_address(running)) as page:
         page.shows("run")
@@ -141,7 +139,7 @@ def is_asked(first: Page, second: Page) -> bool:
 
 @needs_browser
 @pytest.mark.long
-def test_whoever_holds_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
+def test_holders_are_asked_before_others_take_part(stage: Stage) -> None:
     running = live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as first:

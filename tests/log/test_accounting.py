@@ -21,7 +21,7 @@ def gaps_of(came: set[int], end: int) -> list[list[int]]:
 
 
 @given(stream=streams, ticks=st.integers(0, 70))
-def test_an_account_is_what_the_set_of_ticks_says(stream: list[int], ticks: int) -> None:
+def test_accounts_equal_the_set_of_ticks(stream: list[int], ticks: int) -> None:
     account, came, duplicate, reordered, newest = Account(), set[int](), 0, 0, -1
     for tick in stream:
         is_new = tick not in came
@@ -44,7 +44,7 @@ def test_an_account_is_what_the_set_of_ticks_says(stream: list[int], ticks: int)
 
 
 @given(stream=streams, ticks=st.integers(0, 70), most=st.integers(1, 4))
-def test_gaps_are_bounded_and_missing_is_exact_all_the_same(
+def test_gaps_are_bounded_and_missing_is_exact(
     stream: list[int], ticks: int, most: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -67,7 +67,7 @@ def test_gaps_are_bounded_and_missing_is_exact_all_the_same(
     ),
     hopeless=st.integers(0, 50),
 )
-def test_records_from_memory_are_there_once_and_in_order(
+def test_remembered_records_are_stored_once_in_order(
     stream: list[tuple[str, int]], hopeless: int
 ) -> None:
     account, there, newest, reordered, refilled, duplicate = Account(), set[int](), -1, 0, 0, 0
@@ -93,9 +93,7 @@ def test_records_from_memory_are_there_once_and_in_order(
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=30).map(sorted), st.booleans())
-def test_longest_silence_is_longest_time_between_two_that_came(
-    came: list[int], again: bool
-) -> None:
+def test_longest_silence_is_between_two_arrivals(came: list[int], again: bool) -> None:
     account = Account()
     for number, at_ns in enumerate(came):
         account.receive(0 if again else number, at_ns)
@@ -133,7 +131,7 @@ def test_of_very_many_gaps_the_first_are_named() -> None:
         ((), 0, 0, 10),  # it was never there
     ],
 )
-def test_ticks_between_two_starts_are_not_made_and_not_missing(
+def test_ticks_between_starts_are_not_missing(
     first_start: Sequence[int], made: int, missing: int, unmade: int
 ) -> None:
     for told_first in (True, False):
@@ -153,7 +151,7 @@ def test_ticks_between_two_starts_are_not_made_and_not_missing(
         assert account.unpublished == unmade
 
 
-def test_records_under_way_at_a_kill_are_not_made() -> None:
+def test_records_lost_in_a_kill_are_not_made() -> None:
     account = Account()
     gap = StartGap(account, 2)
     account.receive(4)
@@ -167,7 +165,7 @@ def test_records_under_way_at_a_kill_are_not_made() -> None:
 @pytest.mark.parametrize(
     "order", [*permutations(("join", "heard 7", "heard 6", "records"))], ids=" ".join
 )
-def test_what_others_heard_of_a_killed_start_is_missing(
+def test_heard_records_of_killed_starts_are_missing(
     order: Sequence[str],
 ) -> None:
     """0 to 4 came; others heard of 5 and 6; the next start begins with 10."""

@@ -41,7 +41,7 @@ def test_no_message_is_invented(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_of_2000_damaged_files_none_invents_a_message(tmp_path: Path) -> None:
+def test_no_message_is_invented_in_2000_files(tmp_path: Path) -> None:
     draw, files = random.Random(53), shelf()
     cases = [damaged(files, list(files), draw) for _ in range(2000)]
     tally = recovered_all(files, cases, tmp_path)
@@ -58,7 +58,7 @@ def recovered(data: bytes, folder: Path) -> tuple[Recovery, bytes]:
 
 
 @pytest.mark.long
-def test_a_torn_chunk_with_a_zeroed_page_adds_nothing(tmp_path: Path) -> None:
+def test_torn_chunks_with_zeroed_pages_add_nothing(tmp_path: Path) -> None:
     """The attack that gained nine messages."""
     data = recorded("paper", {"duration_s": 3.0})
     truth, draw = Counter(messages(data)), random.Random(1)
@@ -87,7 +87,7 @@ def chunk_offsets(data: bytes) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_a_whole_chunk_in_the_wrong_place_is_refused(finished: bool, tmp_path: Path) -> None:
+def test_misplaced_whole_chunks_are_refused(finished: bool, tmp_path: Path) -> None:
     """Its checksum is right; the index tells, and without an index the order of the times."""
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     places = chunk_offsets(live)
@@ -100,7 +100,7 @@ def test_a_whole_chunk_in_the_wrong_place_is_refused(finished: bool, tmp_path: P
     assert not result.lossless
 
 
-def test_a_lost_definition_is_made_again(tmp_path: Path) -> None:
+def test_a_lost_definition_is_restored(tmp_path: Path) -> None:
     """A message names its member and its kind itself."""
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     torn = bytearray(live[: chunk_offsets(live)[-1][0]])
@@ -148,7 +148,7 @@ def test_a_head_of_another_virtual_run_is_refused(whole: bool, tmp_path: Path) -
     assert b"scenario.toml.damaged" in saved
 
 
-def test_a_chunk_of_another_virtual_run_is_refused(tmp_path: Path) -> None:
+def test_chunks_of_other_virtual_runs_are_refused(tmp_path: Path) -> None:
     """Its checksum is right, and in an unfinished file so are its place and its times."""
     data, other = (recorded("paper", {"duration_s": 1.5, "seed": seed}) for seed in (1, 5))
     (begin, end), (last_begin, last_end) = chunk_offsets(data)
@@ -165,7 +165,7 @@ def test_a_chunk_of_another_virtual_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["without checksums", "damaged chunk"])
-def test_without_anything_to_save_no_file_is_made(kind: str, tmp_path: Path) -> None:
+def test_without_valid_messages_no_file_is_made(kind: str, tmp_path: Path) -> None:
     """Neither a message that nothing proves, nor a file that holds nothing."""
     data = bytearray(recorded("paper"))
     if kind == "without checksums":
@@ -188,7 +188,7 @@ def test_without_anything_to_save_no_file_is_made(kind: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("scenario", ["another = 1", "no TOML", "\xff"])
-def test_a_log_that_no_command_opens_is_stated(scenario: str, tmp_path: Path) -> None:
+def test_an_unopenable_log_is_reported(scenario: str, tmp_path: Path) -> None:
     """Nothing of it is damaged; the new file is read once more, and what a reader says is a loss."""
     text = scenario.encode("latin-1")
     stream = io.BytesIO()
@@ -219,7 +219,7 @@ def without_scenario(data: bytes) -> bytes:
     return bytes(damaged_data)
 
 
-def test_a_lost_scenario_is_taken_from_beside_the_log(tmp_path: Path) -> None:
+def test_lost_scenarios_are_taken_from_beside_logs(tmp_path: Path) -> None:
     data = recorded("paper")
     result, saved = recovered(without_scenario(data), tmp_path)
     assert any("commands of trilat-net do not" in text for text in result.lost)
@@ -250,7 +250,7 @@ def test_check_names_a_zeroed_page(place: str, tmp_path: Path) -> None:
     assert not check_file(path).passed
 
 
-def test_a_cut_run_names_the_ticks_behind_its_last_record(tmp_path: Path) -> None:
+def test_cut_runs_name_ticks_behind_their_end(tmp_path: Path) -> None:
     """A file that was cut off between two chunks looks as if nothing were lost."""
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     result, _ = recovered(live[: chunk_offsets(live)[6][0]], tmp_path)
@@ -259,7 +259,7 @@ def test_a_cut_run_names_the_ticks_behind_its_last_record(tmp_path: Path) -> Non
     assert all("its end is unknown" in text for text in result.missing)
 
 
-def test_a_block_with_one_bad_message_is_left_out(tmp_path: Path) -> None:
+def test_blocks_with_a_bad_message_are_omitted(tmp_path: Path) -> None:
     """Packed bytes that are damaged falsify any part of their block, before and behind what shows."""
     data = recorded("paper", {"duration_s": 3.0})
     (begin, _), *_ = chunk_offsets(data)

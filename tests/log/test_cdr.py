@@ -61,7 +61,7 @@ def bits(numbers: Any) -> list[bytes]:
 
 
 @pytest.mark.parametrize("name", list(cdr.ROS2_SCHEMAS))
-def test_a_schema_text_is_complete_and_the_type_itself(name: str) -> None:
+def test_schema_texts_are_complete_and_hash_right(name: str) -> None:
     """Its hash, by which ROS 2 tells types apart, is that of the type."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(cdr.ROS2_SCHEMAS[name].decode(), name))
@@ -136,7 +136,7 @@ def test_a_string_is_read_as_it_was_written(text: str) -> None:
 
 
 @given(stamps_ns, st.sampled_from(RosLogLevel), words, words)
-def test_line_of_log_is_read_as_it_was_written(
+def test_log_lines_are_read_as_written(
     stamp_ns: int, level: RosLogLevel, name: str, text: str
 ) -> None:
     data = pack_log(stamp_ns, level, name, text)
@@ -156,7 +156,7 @@ def test_line_of_log_is_read_as_it_was_written(
     assert data == serialized(cdr.LOG, own)
 
 
-def test_a_stamp_beyond_ros_2_is_its_last_second() -> None:
+def test_stamps_beyond_ros_2_become_its_last() -> None:
     message = by_rosbags(
         cdr.JOINT_STATE, JointStatePacker(["a"]).pack(2**63, [1.0], [2.0], [3.0])
     )
@@ -239,7 +239,7 @@ def test_diagnostics_are_those_of_rosbags(stamp_ns: int, parts: list[tuple[Any, 
 
 
 @given(st.booleans(), words)
-def test_response_of_trigger_is_boolean_and_text(success: bool, text: str) -> None:
+def test_responses_of_triggers_are_boolean_and_text(success: bool, text: str) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg("bool success\nstring message\n", "std_srvs/msg/Told"))
     told = store.types["std_srvs/msg/Told"](success=success, message=text)
@@ -249,7 +249,7 @@ def test_response_of_trigger_is_boolean_and_text(success: bool, text: str) -> No
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: b"\0\1\0\0" + rest))
-def test_what_is_no_message_is_a_value_error(data: bytes) -> None:
+def test_an_invalid_message_is_a_value_error(data: bytes) -> None:
     for read in (cdr.read_joint_state, lambda one: cdr.read_frame_vectors(one, 7)):
         with suppress(ValueError):
             read(data)

@@ -38,7 +38,7 @@ LOGS = {"paper": paper, "busy": lambda: logs.busy().log, "four": lambda: logs.si
 
 
 @pytest.mark.parametrize("which", LOGS)
-def test_column_names_are_unique_end_in_units_and_are_explained(which: str) -> None:
+def test_column_names_are_unique_with_units(which: str) -> None:
     log = LOGS[which]()
     for table in log.tables():
         names = [column.name for column in table.columns]
@@ -62,7 +62,7 @@ def test_column_names_are_unique_end_in_units_and_are_explained(which: str) -> N
         (True, "its one-way delay, by the offset of"),
     ],
 )
-def test_delays_of_arrivals_say_what_they_are(*, live: bool, said: str) -> None:
+def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:
     """In virtual time nothing is under way: a sample's delay there is no network's."""
     table = build_arrivals_table(paper()["m1"], "run.mcap", live=live)
     (delay,) = (one for one in table.columns if one.name == "delay_us")
@@ -101,7 +101,7 @@ def test_a_row_of_states_is_its_record(which: str) -> None:
 
 
 @pytest.mark.parametrize("which", LOGS)
-def test_a_row_of_arrivals_is_what_a_record_lists(which: str) -> None:
+def test_arrival_rows_equal_a_records_list(which: str) -> None:
     log = LOGS[which]()
     for site in log.sites:
         table = log.table(site, "arrivals")
@@ -146,7 +146,7 @@ def test_a_row_of_statistics_is_its_message() -> None:
     assert table["dropped_malformed_count"].rows(0, 2) == [1, 0]
 
 
-def test_statistics_without_any_have_the_same_columns() -> None:
+def test_empty_statistics_have_the_same_columns() -> None:
     some = opened(recorded("paper"))
     none = opened(a_file(recorded("paper"), []))
     for kind in ("state", "link", "arrivals"):
@@ -157,7 +157,7 @@ def test_statistics_without_any_have_the_same_columns() -> None:
     assert len(none.table("events")) == 0
 
 
-def test_events_are_in_the_order_in_which_they_came() -> None:
+def test_events_are_in_their_order_of_arrival() -> None:
     log = paper()
     told = [
         Event(member="s", boot=2**64 - 1, kind="epoch", text="an epoch", boots={"m1": 5}, n=0),
@@ -184,7 +184,7 @@ def test_events_are_in_the_order_in_which_they_came() -> None:
     ]
 
 
-def test_what_there_is_not_is_answered_with_what_there_is() -> None:
+def test_missing_tables_name_the_existing_ones() -> None:
     log = paper()
     with pytest.raises(KeyError, match="m1, m2, s"):
         log.table("m3")
@@ -194,7 +194,7 @@ def test_what_there_is_not_is_answered_with_what_there_is() -> None:
         log.table("m1")["q1"]
 
 
-def test_arrival_of_peer_that_there_is_not_is_refused() -> None:
+def test_arrivals_of_missing_peers_are_refused() -> None:
     log = opened(edited(recorded("paper"), record=lambda r: {**r, "rx": [[5, 0, 0]]}))
     with pytest.raises(
         LogError, match="record of m1 lists a sample from a site that is not a peer"
@@ -202,7 +202,7 @@ def test_arrival_of_peer_that_there_is_not_is_refused() -> None:
         log.table("m1", "arrivals")
 
 
-def test_a_number_that_64_bits_do_not_hold_is_refused() -> None:
+def test_numbers_beyond_64_bits_are_refused() -> None:
     every = messages(recorded("paper"))
     event = next(m for m in every if m[0].endswith("/event"))
     log = opened(a_file(recorded("paper"), [changed(event, ticks=2**64 - 1)]))
@@ -210,7 +210,7 @@ def test_a_number_that_64_bits_do_not_hold_is_refused() -> None:
         log.table("events")
 
 
-def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
+def test_missing_numbers_in_columns_are_nan() -> None:
     known = np.array([True, False])
     column = Column("x_us", np.array([3, 4]), known=known)
     assert column.rows(0, 2) == [3, None]
@@ -240,7 +240,7 @@ def test_a_frame_is_its_table(name: str, kind: str) -> None:
         ("pandas", lambda log: log.to_frame()),
     ],
 )
-def test_a_missing_frame_library_is_named_with_its_install(
+def test_missing_frame_libraries_name_their_installation(
     library: str, frame: Callable[[Log], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
@@ -253,7 +253,7 @@ ENDINGS = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}
 
 
 @pytest.mark.parametrize("kind", [State, LinkStats, Event, RecorderStats])
-def test_every_field_has_a_meaning_and_the_unit_it_names(kind: type[msgspec.Struct]) -> None:
+def test_every_field_has_meaning_and_unit(kind: type[msgspec.Struct]) -> None:
     said = read_field_docs(kind)
     assert list(said) == list(kind.__struct_fields__)
     for field, (unit, text, json_type) in said.items():

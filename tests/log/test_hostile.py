@@ -37,7 +37,7 @@ MEMORY_MIB = 256
 @pytest.mark.parametrize("change", dict.fromkeys(CHANGES), ids=lambda change: change.__name__)
 @settings(max_examples=4)
 @given(seed=st.integers(0, 2**32), whole=st.booleans())
-def test_whatever_is_changed_everybody_answers_in_a_sentence(
+def test_any_change_gets_a_sentence_as_answer(
     change: Callable[[bytes, Any], bytes], seed: int, whole: bool
 ) -> None:
     """open_log and its arrays, verify, info, check, recover and replay: an answer or a `TrilatError`."""
@@ -50,7 +50,7 @@ def test_whatever_is_changed_everybody_answers_in_a_sentence(
 
 @settings(max_examples=6)
 @given(st.integers(0, 2**32))
-def test_several_changes_at_once(seed: int) -> None:
+def test_several_changes_get_an_answer(seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "changed.mcap"
         path.write_bytes(mangled(DATA, random.Random(seed)))
@@ -147,7 +147,7 @@ def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None
     assert int(done.stdout) / 1024 < MEMORY_MIB
 
 
-def test_a_tick_that_the_scenario_does_not_have_is_refused() -> None:
+def test_ticks_outside_the_scenario_are_refused() -> None:
     """Nobody counts up to a number that a stranger wrote, nor keeps a place for every one before it."""
     data = edited(DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r)
     log = opened(data)
@@ -158,7 +158,7 @@ def test_a_tick_that_the_scenario_does_not_have_is_refused() -> None:
         _ = log["m1"]
 
 
-def test_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
+def test_claims_of_endless_ticks_are_refused() -> None:
     log = opened(edited(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
     endless = [
         msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events
@@ -182,7 +182,7 @@ def test_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
         ),
     ],
 )
-def test_a_scenario_of_a_stranger_is_refused_in_a_sentence(text: str, problem: str) -> None:
+def test_foreign_scenarios_are_refused_in_a_sentence(text: str, problem: str) -> None:
     with pytest.raises(ScenarioError, match=problem):
         parse_embedded(text)
 
@@ -197,7 +197,7 @@ def test_a_scenario_in_a_log_names_no_file() -> None:
         parse_embedded(text)
 
 
-def test_a_trace_that_stands_for_many_links_is_refused() -> None:
+def test_traces_of_too_many_links_are_refused() -> None:
     """Written out it would fill the memory; a scenario that ran has every link's own."""
     text = load_scenario("paper").text
     head, _, links = text.partition("[links.")
@@ -225,7 +225,7 @@ def test_links_that_would_fill_the_memory_are_refused() -> None:
         parse_embedded(text)
 
 
-def test_json_of_anything_is_finite(tmp_path: Path) -> None:
+def test_json_is_always_finite(tmp_path: Path) -> None:
     """What a machine is told can be read by it, whatever the file says."""
     path = tmp_path / "strange.mcap"
     path.write_bytes(

@@ -72,9 +72,7 @@ def path(data: bytes, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("peer", "site"), [("m1", "s"), ("s", "m1"), ("m2", "s"), ("m1", "m2")]
 )
-def test_every_sample_has_the_delay_that_its_receiver_recorded(
-    path: Path, peer: str, site: str
-) -> None:
+def test_samples_have_their_recorded_delay(path: Path, peer: str, site: str) -> None:
     """By its own stamp; lost ones as infinity, negative ones as none, the shorter of two."""
     rate_hz = 333 if peer == "m2" else 1000
     rows = dict(read_link_delays(path, f"{peer}->{site}"))
@@ -88,9 +86,7 @@ def test_every_sample_has_the_delay_that_its_receiver_recorded(
 
 
 @pytest.mark.parametrize("rate_hz", [1000, 333])
-def test_link_that_replays_log_gives_each_sample_its_measured_delay(
-    path: Path, rate_hz: int
-) -> None:
+def test_replayed_logs_give_measured_delays(path: Path, rate_hz: int) -> None:
     """In [link] each link reads its own; to the microsecond, at any rate."""
     link = {"model": "trace", "file": str(path)}
     scenario = load_scenario("paper", {**OVERRIDES, "link": link})
@@ -107,7 +103,7 @@ def test_link_that_replays_log_gives_each_sample_its_measured_delay(
             assert release == first_tick_at(max(due_ns, tick_ns(tick, rate_hz) + 1), 1000)
 
 
-def test_each_link_names_the_links_delays_that_it_wants(path: Path) -> None:
+def test_links_choose_their_delays_by_name(path: Path) -> None:
     shared = {"model": "trace", "file": str(path), "at_end": "loop"}
     links = load_scenario(
         "paper", {**OVERRIDES, "link": shared, "links.m1->s": {"of": "s->m1"}}
@@ -118,7 +114,7 @@ def test_each_link_names_the_links_delays_that_it_wants(path: Path) -> None:
     assert parse_trace(texts["m1->s"])[0, 1] == delay_us("s", "m1", 0)
 
 
-def test_a_scenario_that_ran_does_not_need_the_log_again(path: Path) -> None:
+def test_executed_scenarios_do_not_need_the_log(path: Path) -> None:
     scenario = load_scenario(
         "paper", {**OVERRIDES, "link": {"model": "trace", "file": str(path)}}
     )
@@ -148,15 +144,13 @@ def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> 
     ("link", "words"),
     [("m1->ss", "did you mean 'm1->s'"), ("x", "The links are m2->m1"), ("m1->m1", "no link")],
 )
-def test_link_that_log_does_not_have_is_named_with_nearest(
-    path: Path, link: str, words: str
-) -> None:
+def test_missing_links_name_the_nearest(path: Path, link: str, words: str) -> None:
     with pytest.raises(ValueError, match="no link") as error:
         read_link_delays(path, link)
     assert words in str(error.value)
 
 
-def test_a_link_over_which_nothing_came_has_no_delays(data: bytes, path: Path) -> None:
+def test_links_without_arrivals_have_no_delays(data: bytes, path: Path) -> None:
     def silent(record: dict[str, Any]) -> dict[str, Any]:
         return {**record, "rx": [entry for entry in record["rx"] if entry[0] != 0]}
 
@@ -166,14 +160,14 @@ def test_a_link_over_which_nothing_came_has_no_delays(data: bytes, path: Path) -
 
 
 @pytest.mark.parametrize("content", [b"", b"t_s,delay_ms\n0,1\n", b"\x89MCAP0\r\n"])
-def test_file_that_is_no_log_is_refused_with_keys_path(tmp_path: Path, content: bytes) -> None:
+def test_invalid_logs_are_refused_with_their_key(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "run.mcap").write_bytes(content)
     with pytest.raises(ScenarioError) as error:
         load_scenario("paper", {"link": {"model": "trace", "file": str(tmp_path / "run.mcap")}})
     assert error.value.path == "link.file"
 
 
-def test_log_that_is_not_there_is_refused_with_keys_path(tmp_path: Path) -> None:
+def test_missing_logs_are_refused_with_their_key(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="No such file") as error:
         load_scenario(
             "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}}

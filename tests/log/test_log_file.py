@@ -48,7 +48,7 @@ def messages(path: Path) -> list[Sent]:
 # Names.
 
 
-def test_a_log_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
+def test_logs_are_renamed_when_whole(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogFile(path) as file:
         container = begun(file)
@@ -61,7 +61,7 @@ def test_a_log_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
     assert messages(path) == [(1, 0, b"x", 0, 0)]
 
 
-def test_only_what_is_flushed_is_in_the_file(tmp_path: Path) -> None:
+def test_only_flushed_data_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     file = LogFile(path)
     container = begun(file)
@@ -79,7 +79,7 @@ def test_only_what_is_flushed_is_in_the_file(tmp_path: Path) -> None:
     file.close()
 
 
-def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> None:
+def test_unfinished_logs_keep_their_temporary_name(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
 
     def fail() -> None:
@@ -102,13 +102,13 @@ def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> Non
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
 
-def test_a_file_into_which_nothing_was_written_is_not_there(tmp_path: Path) -> None:
+def test_empty_files_are_removed(tmp_path: Path) -> None:
     with LogFile(tmp_path / "run.mcap") as file:
         file.write(b"not flushed")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_log_is_replaced_by_a_whole_one(tmp_path: Path) -> None:
+def test_existing_logs_are_replaced_by_whole_ones(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"precious")
     with (
@@ -125,7 +125,7 @@ def test_an_existing_log_is_replaced_by_a_whole_one(tmp_path: Path) -> None:
     assert messages(path) == []
 
 
-def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
+def test_names_taken_meanwhile_are_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
 
     def write() -> None:
@@ -141,7 +141,7 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
     assert messages(active_path(path)) == []
 
 
-def test_a_log_open_elsewhere_is_kept_beside_as_windows_does(
+def test_logs_open_elsewhere_are_kept_as_on_windows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Windows replaces no file that a viewer has open."""
@@ -164,7 +164,7 @@ def test_a_log_open_elsewhere_is_kept_beside_as_windows_does(
     assert messages(active_path(path)) == []
 
 
-def test_without_hard_links_a_log_still_gets_its_name(
+def test_without_hard_links_logs_get_their_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def link(*_: object) -> None:
@@ -177,7 +177,7 @@ def test_without_hard_links_a_log_still_gets_its_name(
 
 
 @pytest.mark.parametrize("name", ["no/run.mcap", "", "x" * 300])
-def test_a_file_that_cannot_be_made_is_bad_input(name: str, tmp_path: Path) -> None:
+def test_an_uncreatable_file_is_bad_input(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"cannot be written|is not a file"):
         LogFile(tmp_path / name)
 
@@ -192,9 +192,7 @@ def little_margin(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @in_this_folder
 @given(count=st.integers(1, 40), most=st.integers(1, 100))
-def test_a_disk_that_takes_little_at_a_time_takes_all(
-    count: int, most: int, tmp_path: Path
-) -> None:
+def test_slow_disks_take_everything(count: int, most: int, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
     wanted = sent(count)
@@ -229,7 +227,7 @@ def recorded(file: LogFile, wanted: list[Sent], flushed: list[Sent]) -> None:
 
 
 @pytest.mark.usefixtures("unsynced", "little_margin")
-def test_wherever_a_disk_fills_the_log_ends_in_order(tmp_path: Path) -> None:
+def test_logs_end_in_order_at_full_disks(tmp_path: Path) -> None:
     """At every byte of a chunk: the file is whole, with the chunk that did not fit any more."""
     path = tmp_path / "run.mcap"
     wanted = sent(60 * CHUNK)
@@ -254,7 +252,7 @@ def test_wherever_a_disk_fills_the_log_ends_in_order(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unsynced", "little_margin")
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO])
-def test_without_room_for_the_end_whole_chunks_are_kept(error: int, tmp_path: Path) -> None:
+def test_without_room_whole_chunks_are_kept(error: int, tmp_path: Path) -> None:
     """At every byte of a chunk and of the end: cut where the last flush ended."""
     path = tmp_path / "run.mcap"
     wanted = sent(3 * CHUNK)
@@ -282,7 +280,7 @@ def test_without_room_for_the_end_whole_chunks_are_kept(error: int, tmp_path: Pa
         path.unlink()
 
 
-def test_room_is_kept_for_what_is_pending_and_for_end(tmp_path: Path) -> None:
+def test_room_is_kept_for_pending_and_end(tmp_path: Path) -> None:
     disk = SmallDisk(10 << 20)
     file = file_on(disk, tmp_path / "run.mcap")
     container = begun(file)
@@ -297,7 +295,7 @@ def test_room_is_kept_for_what_is_pending_and_for_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [None, errno.EOPNOTSUPP, errno.EACCES])
-def test_a_reserve_takes_hidden_room_and_gives_it_back(
+def test_reserves_take_and_return_hidden_room(
     error: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without `posix_fallocate` it is written; a folder that takes no reserve does without."""
@@ -343,7 +341,7 @@ except LogRefused as refused:
 """
 
 
-def test_a_file_of_the_largest_size_is_cut_and_recovered(tmp_path: Path) -> None:
+def test_largest_files_are_cut_and_recovered(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60
@@ -359,7 +357,7 @@ def test_a_file_of_the_largest_size_is_cut_and_recovered(tmp_path: Path) -> None
 # Loss of power.
 
 
-def test_flushed_data_is_synced_every_second_or_when_durable_always(
+def test_flushed_data_is_synced_as_configured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[int] = []
@@ -376,7 +374,7 @@ def test_flushed_data_is_synced_every_second_or_when_durable_always(
         file.close()
 
 
-def test_disk_that_refuses_what_it_had_taken_ends_log(
+def test_disks_that_lose_accepted_data_end_logs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_: int) -> None:
@@ -417,7 +415,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_what_was_flushed_survives_a_kill(tmp_path: Path) -> None:
+def test_flushed_data_survives_a_kill(tmp_path: Path) -> None:
     path, count = tmp_path / "run.mcap", 100
     done = subprocess.run(
         [sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60

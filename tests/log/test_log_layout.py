@@ -35,7 +35,7 @@ PATTERNS = st.lists(
 
 
 @given(expression=PATTERNS, key=KEYS)
-def test_an_expression_matches_what_it_includes_for_zenoh(expression: str, key: str) -> None:
+def test_expressions_match_like_those_of_zenoh(expression: str, key: str) -> None:
     try:
         known = zenoh.KeyExpr(expression)
     except zenoh.ZError:  # another spelling of one that is known
@@ -44,7 +44,7 @@ def test_an_expression_matches_what_it_includes_for_zenoh(expression: str, key: 
 
 
 @pytest.mark.parametrize("text", ["", "a//b", "a*", "***", "a/$", "a?", "#", "*m1/**"])
-def test_what_is_no_expression_is_refused(text: str) -> None:
+def test_an_invalid_expression_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="must be a key expression such as"):
         parse_channel_filter([text], [])
     with pytest.raises(UsageError, match="exclude must be"):
@@ -57,7 +57,7 @@ def test_a_leading_slash_is_fine() -> None:
     )
 
 
-def test_an_unchosen_channel_is_absent_and_the_file_says_so() -> None:
+def test_absent_channels_are_declared_in_the_file() -> None:
     stream = io.BytesIO()
     chosen = ChannelFilter(("trilat/*/m$*/**",), ("**/link",))
     writer = LogWriter(

@@ -27,7 +27,7 @@ TICKS = 120
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_two_virtual_runs_of_one_scenario_are_the_same_file(name: str) -> None:
+def test_equal_virtual_runs_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):
         stream = io.BytesIO()
@@ -44,14 +44,14 @@ def test_another_seed_is_another_file() -> None:
     )
 
 
-def test_a_virtual_log_has_no_path_and_no_wall_clock() -> None:
+def test_virtual_logs_have_no_path_or_clock() -> None:
     data = edited(recorded("paper"))
     assert str(Path(__file__).parents[2]).encode() not in data
     for _, _, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
         assert message.log_time == message.publish_time < 10**9
 
 
-def test_the_plain_reader_finds_every_payload_byte_for_byte() -> None:
+def test_plain_readers_find_every_payload_byte() -> None:
     scenario = load_scenario("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
     sent = {
         (site.name, output.tick): encode_state(
@@ -119,7 +119,7 @@ def test_every_message_is_one_that_its_schema_allows() -> None:
     assert kinds == {"state", "link", "event"}
 
 
-def test_session_scenario_and_accounts_stand_in_the_file() -> None:
+def test_files_hold_session_scenario_and_accounts() -> None:
     reader = make_reader(io.BytesIO(recorded("paper")))
     metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
     session = metadata["trilat.session"]
@@ -145,7 +145,7 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
         )
 
 
-def test_session_and_scenario_stand_before_the_first_message() -> None:
+def test_session_and_scenario_precede_the_first_message() -> None:
     """So that they survive a crash right after the start."""
     stream = io.BytesIO()
     LogWriter(stream, load_scenario("free"), "lab", "live", 10**18, collect_provenance())
@@ -202,7 +202,7 @@ def test_the_reader_gives_arrays_with_time() -> None:
 # What is torn, damaged, or not ours.
 
 
-def test_file_cut_anywhere_opens_as_far_as_it_is_whole() -> None:
+def test_cut_files_open_as_far_as_whole() -> None:
     """It says that it is not complete, or is refused; nothing else comes out."""
     data = edited(recorded("paper"), chunk_bytes=4096)
     before = 0
@@ -222,7 +222,7 @@ def test_file_cut_anywhere_opens_as_far_as_it_is_whole() -> None:
 @pytest.mark.parametrize(
     "data", [b"", b"no log at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + b"\0" * 99]
 )
-def test_what_is_no_mcap_file_is_refused(data: bytes, tmp_path: Path) -> None:
+def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(LogError):
         opened(data)
     path = tmp_path / "no.mcap"
@@ -236,7 +236,7 @@ def test_an_mcap_file_of_others_is_refused() -> None:
         opened(foreign())
 
 
-def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
+def test_mcap_files_using_our_names_are_refused() -> None:
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
@@ -249,7 +249,7 @@ def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
         len(opened(stream.getvalue())["m1"])
 
 
-def test_unreadable_events_are_left_out_and_the_log_is_read() -> None:
+def test_unreadable_events_are_omitted() -> None:
     """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
     whole = opened(recorded("paper"))
     odd = opened(
@@ -275,7 +275,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["not toml [", "name = 'x'", "\udcff"])
-def test_a_log_whose_scenario_cannot_be_read_is_refused(text: str) -> None:
+def test_logs_with_unreadable_scenarios_are_refused(text: str) -> None:
     def scenario(_: str) -> str:
         return text.replace("\udcff", "")
 
@@ -286,7 +286,7 @@ def test_a_log_whose_scenario_cannot_be_read_is_refused(text: str) -> None:
 @pytest.mark.parametrize(
     "change", [{"v": VERSION + 1}, {"q": [0.0]}, {"used": 3}, {"tick": -1}]
 )
-def test_a_log_with_a_record_that_is_none_is_refused(change: dict[str, object]) -> None:
+def test_logs_with_invalid_records_are_refused(change: dict[str, object]) -> None:
     data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
     with pytest.raises(LogError, match="record of m1"):
         _ = opened(data)["m1"].states

@@ -42,13 +42,13 @@ def problem(path: Path, key: Path) -> str:
     return "" if found.passed else found.text
 
 
-def test_what_was_signed_holds_and_the_log_is_not_touched(signed: tuple[Path, Path]) -> None:
+def test_signatures_hold_without_touching_the_log(signed: tuple[Path, Path]) -> None:
     path, key = signed
     assert path.read_bytes() == recorded("paper")
     assert problem(path, key) == ""
 
 
-def test_ed25519_is_that_of_rfc_8032_over_digests_in_words(signed: tuple[Path, Path]) -> None:
+def test_signatures_follow_rfc_8032_over_digests(signed: tuple[Path, Path]) -> None:
     """The file is enough for any other program: the bytes that are signed are made of it alone."""
     path, key = signed
     stated = json.loads(path.with_name("run.mcap.sig").read_text())
@@ -64,9 +64,7 @@ def test_ed25519_is_that_of_rfc_8032_over_digests_in_words(signed: tuple[Path, P
 @pytest.mark.parametrize(
     "what", ["log", "chain", "signature", "log and chain", "another's", "gone", "text"]
 )
-def test_whatever_is_changed_shows(
-    what: str, signed: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_any_change_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) -> None:
     path, key = signed
     file = path.with_name("run.mcap.sig")
     stated = json.loads(file.read_text())
@@ -91,7 +89,7 @@ def test_whatever_is_changed_shows(
     assert problem(path, key)
 
 
-def test_only_what_agrees_with_its_chain_is_signed(tmp_path: Path) -> None:
+def test_only_logs_agreeing_with_chains_are_signed(tmp_path: Path) -> None:
     private, key = create_signing_keys(tmp_path / "lab")
     path = tmp_path / "run.mcap"
     path.write_bytes(recorded("paper")[:-200])
@@ -103,9 +101,7 @@ def test_only_what_agrees_with_its_chain_is_signed(tmp_path: Path) -> None:
     assert problem(made, key) == ""
 
 
-def test_keys_that_are_none_or_open_to_others_are_refused(
-    signed: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_invalid_or_open_keys_are_refused(signed: tuple[Path, Path], tmp_path: Path) -> None:
     path, public = signed
     private = tmp_path / "lab.key"
     with pytest.raises(UsageError, match=r"exists; choose another name"):
@@ -129,7 +125,7 @@ def test_keys_that_are_none_or_open_to_others_are_refused(
         create_signing_keys(tmp_path / "lab")
 
 
-def test_keys_are_their_owners_and_a_full_disk_leaves_none(tmp_path: Path) -> None:
+def test_keys_are_private_and_full_disks_leave_none(tmp_path: Path) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     with (
         mock.patch("os.fsync", side_effect=full),
@@ -141,7 +137,7 @@ def test_keys_are_their_owners_and_a_full_disk_leaves_none(tmp_path: Path) -> No
     assert private.stat().st_mode & 0o777 == 0o600
 
 
-def test_the_command_says_yes_by_0_and_no_by_1(tmp_path: Path) -> None:
+def test_the_command_exits_0_or_1(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(recorded("paper"))
     trilat("keys", "pair", "lab", cwd=tmp_path).succeeds()
     trilat("log", "sign", "run.mcap", "--key", "lab.key", cwd=tmp_path).succeeds()

@@ -78,7 +78,7 @@ STEPS = st.lists(
     size=st.none() | st.integers(10_000, 120_000),
     duration_ns=st.none() | st.integers(1, 3 * 10**9),
 )
-def test_the_parts_one_behind_the_other_are_the_unsplit_file(
+def test_joined_parts_are_the_unsplit_file(
     steps: list[tuple[str, int, int]], size: int | None, duration_ns: int | None, tmp_path: Path
 ) -> None:
     path = cleared(tmp_path)
@@ -120,7 +120,7 @@ def test_the_parts_one_behind_the_other_are_the_unsplit_file(
     assert found == messages
 
 
-def test_part_opens_as_log_and_all_parts_open_as_one(tmp_path: Path) -> None:
+def test_parts_open_alone_and_together(tmp_path: Path) -> None:
     messages = [(KEYS[0], b"\x80" * 900, 10**18 + k * 10**8, k) for k in range(40)]
     path = tmp_path / "run.mcap"
     written(LogStorage(path, split_ns=10**9), messages)
@@ -147,7 +147,7 @@ def test_part_opens_as_log_and_all_parts_open_as_one(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_to_continue_is_to_write_the_next_part(
+def test_continuing_writes_the_next_part(
     there: list[str], splits: bool, expected: str, previous: str | None, tmp_path: Path
 ) -> None:
     for name in there:
@@ -165,7 +165,7 @@ def test_to_continue_is_to_write_the_next_part(
 @pytest.mark.parametrize(
     "there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"]
 )
-def test_a_taken_name_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
+def test_taken_names_are_refused_unless_replaceable(there: str, tmp_path: Path) -> None:
     (tmp_path / there).write_bytes(b"precious")
     place = LogStorage(tmp_path / "run.mcap", split_ns=1)
     with pytest.raises(UsageError, match=f"{there}.* exists.*force=True"):
@@ -178,7 +178,7 @@ def test_a_taken_name_is_refused_unless_it_may_be_replaced(there: str, tmp_path:
     ]
 
 
-def test_a_log_without_parts_leaves_the_parts_of_others_alone(tmp_path: Path) -> None:
+def test_unsplit_logs_leave_other_parts_alone(tmp_path: Path) -> None:
     (tmp_path / "run-002.mcap").write_bytes(b"precious")
     for force in (False, True):
         written(LogStorage(tmp_path / "run.mcap", force=force), [(KEYS[0], b"\x80", 10**18, 0)])
@@ -198,12 +198,12 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [0.5, float("nan"), 0.0, 1e7])
-def test_a_part_that_cannot_be_meant_is_refused(number: float) -> None:
+def test_an_invalid_part_is_refused(number: float) -> None:
     with pytest.raises(UsageError, match="split_size must be a number of MiB"):
         parse_split("--split-size", "MiB", number, 1 << 20)
 
 
-def test_to_continue_and_to_replace_at_once_is_refused(tmp_path: Path) -> None:
+def test_continuing_and_replacing_at_once_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="give only one of these options"):
         LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).find_first_part()
 
@@ -236,7 +236,7 @@ def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]
     return taken
 
 
-def test_disk_that_is_full_at_seam_keeps_parts_before(tmp_path: Path) -> None:
+def test_full_disks_at_seams_keep_earlier_parts(tmp_path: Path) -> None:
     """At every step of a log in parts: all parts are whole, and hold all that was given to them."""
     messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
     for room in range(80_000, 200_000, 7900):
@@ -249,7 +249,7 @@ def test_disk_that_is_full_at_seam_keeps_parts_before(tmp_path: Path) -> None:
         assert all(part.name.endswith(".mcap") for part in tmp_path.iterdir())
 
 
-def test_who_adds_after_the_end_is_told(tmp_path: Path) -> None:
+def test_adding_after_the_end_is_refused(tmp_path: Path) -> None:
     with LogParts(LogStorage(tmp_path / "run.mcap"), begin) as log:
         log.finish({})
         with pytest.raises(LogRefused, match="is finished"):

@@ -65,7 +65,7 @@ def test_messages_come_with_their_times_and_their_numbers() -> None:
 
 @settings(max_examples=30)
 @given(st.integers(0, len(DATA) - 1))
-def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
+def test_torn_files_give_every_whole_chunk(size: int) -> None:
     """Wherever it is cut, what lies in whole chunks before is read, and the cut is told."""
     whole = [frame for frame in CHUNKS if frame.end <= size]
     if size < 8:
@@ -89,7 +89,7 @@ FOREIGN = st.binary(min_size=1, max_size=300)
 
 @settings(max_examples=40)
 @given(OFFSETS, FOREIGN)
-def test_a_scan_leaves_out_no_byte(offset: int, foreign: bytes) -> None:
+def test_scans_omit_no_byte(offset: int, foreign: bytes) -> None:
     """Records and damaged parts follow each other without a gap up to the end mark."""
     data = overwritten(offset, foreign)
     scanner = RecordScanner(io.BytesIO(data))
@@ -117,7 +117,7 @@ def test_a_scan_leaves_out_no_byte(offset: int, foreign: bytes) -> None:
 
 @settings(max_examples=20)
 @given(OFFSETS, FOREIGN)
-def test_both_ways_of_reading_give_the_same(offset: int, foreign: bytes) -> None:
+def test_both_ways_of_reading_agree(offset: int, foreign: bytes) -> None:
     """Who reads the messages alone, and who scans the records, finds the same in a damaged file."""
     data = overwritten(offset, foreign)
     walk, items = walked(data)
@@ -159,7 +159,7 @@ def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObje
 
 @settings(max_examples=30)
 @given(st.sampled_from(FRAMES), st.integers(0, (1 << 64) - 1))
-def test_a_record_of_false_length_hides_few_chunks(frame: RecordFrame, length: int) -> None:
+def test_a_false_record_length_hides_few_chunks(frame: RecordFrame, length: int) -> None:
     """Reading goes on at the next chunk that makes sense, and what is between is named."""
     changed = bytearray(DATA)
     struct.pack_into("<Q", changed, frame.offset + 1, length)
@@ -176,7 +176,7 @@ def test_a_record_of_false_length_hides_few_chunks(frame: RecordFrame, length: i
         assert [item for item in ITEMS if item not in items] == hidden
 
 
-def test_a_chunk_unpacks_to_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_unpack_within_their_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """However it is packed, and whatever it says: nothing is unpacked beyond the limit."""
     monkeypatch.setattr(mcap_records, "MAX_UNPACKED_BYTES", 10_000)
     fine, bomb = bytes(10_000), bytes(1_000_000)
@@ -191,7 +191,7 @@ def test_a_chunk_unpacks_to_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("claim", [1 << 40, (1 << 63) - 1])
-def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
+def test_frames_claiming_huge_sizes_are_refused(claim: int) -> None:
     """The sizes inside the compressed data are compared before a byte is set aside for them."""
     zstd = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", claim) + b"\x01\x00\x00"
     head = (
@@ -214,7 +214,7 @@ def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
         unpack_chunk(head + lz4_)
 
 
-def test_file_that_holds_absurdly_much_is_refused_with_place(
+def test_absurd_contents_are_refused_with_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
@@ -250,7 +250,7 @@ def test_an_absurdly_large_channel_ends_there_alone(
     assert odd in cut.problem
 
 
-def test_arms_at_rest_are_not_absurd_however_well_they_pack(
+def test_resting_arms_are_never_absurd(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The hands of `outage` do not push before 3 s, and its arms know their weight."""
@@ -267,7 +267,7 @@ def test_a_chunk_within_a_chunk_is_not_read() -> None:
     assert walked(data)[1] == ITEMS
 
 
-def test_a_channel_is_what_it_was_first_called() -> None:
+def test_channels_keep_their_first_definition() -> None:
     """A second definition of its number changes nothing; a message of no channel has no topic."""
 
     def channel(number: int, topic: bytes) -> bytes:
@@ -298,7 +298,7 @@ def test_an_attachment_whose_checksum_differs_is_damaged() -> None:
     assert items == ITEMS
 
 
-def test_progress_is_told_up_to_the_end() -> None:
+def test_progress_is_reported_up_to_the_end() -> None:
     told: list[tuple[int, int]] = []
     list(McapReader(io.BytesIO(DATA), "file", lambda *sizes: told.append(sizes)).messages())
     assert told == sorted(told)
@@ -306,7 +306,7 @@ def test_progress_is_told_up_to_the_end() -> None:
     assert told[-1][0] >= len(DATA) - 8
 
 
-def test_zstd_without_a_size_in_its_frame_is_read() -> None:
+def test_zstd_frames_without_size_are_read() -> None:
     """Other writers stream; their chunks say the size, their frames do not."""
     records = bytes(range(256)) * 10
     streamed = zstandard.ZstdCompressor(write_content_size=False).compress(records)

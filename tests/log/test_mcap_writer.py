@@ -89,7 +89,7 @@ def read(data: bytes) -> dict[str, Any]:
 
 @settings(max_examples=40)
 @given(calls=CALLS, chunk_bytes=st.sampled_from([1, 200, 1 << 20]))
-def test_every_reader_finds_what_mcaps_own_writer_wrote(
+def test_files_equal_those_of_mcaps_writer(
     calls: list[tuple[Any, ...]], chunk_bytes: int
 ) -> None:
     found, expected = read(ours(calls, chunk_bytes)), read(theirs(calls, chunk_bytes))
@@ -108,7 +108,7 @@ def test_the_same_calls_give_the_same_bytes(
     assert [record.data for record in records if type(record).__name__ == "Message"] == payloads
 
 
-def test_channel_that_comes_later_stands_before_messages_that_wait() -> None:
+def test_late_channels_precede_waiting_messages() -> None:
     stream = io.BytesIO()
     file = McapWriter(stream, "lib")
     begun(file)
@@ -121,7 +121,7 @@ def test_channel_that_comes_later_stands_before_messages_that_wait() -> None:
     assert found == [("/a", b"x"), ("/late", b"{}")]
 
 
-def test_the_index_of_a_chunk_takes_bytes_and_no_objects() -> None:
+def test_chunk_indices_take_bytes_without_objects() -> None:
     """Memory: 36 000 chunks an hour must be some megabytes."""
     file = McapWriter(io.BytesIO(), "lib")
     schema = file.register_schema("S", "jsonschema", b"{}")

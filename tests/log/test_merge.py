@@ -86,7 +86,7 @@ def place_of(topic_end: str, number: int = 0) -> int:
         ("s/event", {"text": "no"}, "event 0 of s"),
     ],
 )
-def test_parts_that_tell_same_differently_are_refused_by_their_names(
+def test_contradicting_parts_are_refused_by_name(
     where: str, fields: dict[str, object], named: str, tmp_path: Path
 ) -> None:
     every = messages(whole())
@@ -108,7 +108,7 @@ def test_parts_that_tell_same_differently_are_refused_by_their_names(
         ({}, load_scenario("free").text, "scenario is [0-9a-f]{16}, not "),
     ],
 )
-def test_files_of_different_sessions_are_refused_with_what_differs(
+def test_other_sessions_are_refused_with_differences(
     session: dict[str, str], scenario: str | None, named: str, tmp_path: Path
 ) -> None:
     one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
@@ -120,7 +120,7 @@ def test_files_of_different_sessions_are_refused_with_what_differs(
         open_log(one, two)
 
 
-def test_torn_part_whose_hole_another_one_fills_leaves_whole_complete() -> None:
+def test_parts_fill_holes_of_torn_parts() -> None:
     every = messages(whole())
     torn = a_file(whole(), every[:150], finished=False)
     carried_on = a_file(whole(), every[100:], part=2)
@@ -129,7 +129,7 @@ def test_torn_part_whose_hole_another_one_fills_leaves_whole_complete() -> None:
     assert joined(torn, carried_on).complete
 
 
-def test_a_record_that_no_part_has_is_missing() -> None:
+def test_a_record_missing_in_all_parts_is_missing() -> None:
     every = messages(whole())
     torn = a_file(whole(), every[:150], finished=False)
     log = joined(torn, a_file(whole(), every[151:], part=2))
@@ -138,7 +138,7 @@ def test_a_record_that_no_part_has_is_missing() -> None:
     assert sum("missing 1" in log.account(name) for name in log.sites) == 1
 
 
-def test_an_unnamed_or_unfinished_part_leaves_the_whole_incomplete() -> None:
+def test_unfinished_parts_leave_the_whole_incomplete() -> None:
     parts = dealt(whole(), [range(100), range(100, 200), range(200, count())])
     assert joined(*parts).complete
     assert not joined(parts[0], parts[2]).complete
@@ -185,7 +185,7 @@ def test_drops_counted_across_parts_are_counted_once() -> None:
     assert [event.boot for event in log.events] == [1, 2]
 
 
-def test_events_without_numbers_are_told_apart_by_their_content() -> None:
+def test_unnumbered_events_differ_by_content() -> None:
     every = messages(whole())
     place = place_of("m1/event")
     old = [changed(every[place], n=-1, text=text) for text in ("a", "b")]
@@ -195,7 +195,7 @@ def test_events_without_numbers_are_told_apart_by_their_content() -> None:
     assert [event.text for event in log.events] == ["a", "b"]
 
 
-def test_progress_is_told_of_all_parts_as_one(tmp_path: Path) -> None:
+def test_progress_covers_all_parts(tmp_path: Path) -> None:
     parts = dealt(whole(), [range(200), range(200, count())])
     paths = [tmp_path / f"run-{n}.mcap" for n in range(2)]
     for path, data in zip(paths, parts, strict=True):
@@ -208,7 +208,7 @@ def test_progress_is_told_of_all_parts_as_one(tmp_path: Path) -> None:
     assert total - 100 < told[-1][0] <= total
 
 
-def test_a_part_with_an_invalid_message_is_refused_by_name(tmp_path: Path) -> None:
+def test_parts_with_invalid_messages_are_named(tmp_path: Path) -> None:
     every = messages(whole())
     first, second = tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"
     first.write_bytes(a_file(whole(), every[:100]))
@@ -221,7 +221,7 @@ def test_a_part_with_an_invalid_message_is_refused_by_name(tmp_path: Path) -> No
         open_log(first, second)
 
 
-def test_a_session_that_opens_says_what_it_is() -> None:
+def test_an_opened_session_states_its_parts() -> None:
     parts = dealt(whole(), [range(200), range(200, count())])
     log = joined(*parts)
     assert repr(log) == (

@@ -49,7 +49,7 @@ def decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
                 yield channel.topic, decode(message.data), message
 
 
-def test_mcap_package_reads_same_with_index_and_without(log_file: Path) -> None:
+def test_mcap_reads_equal_data_without_index(log_file: Path) -> None:
     data = log_file.read_bytes()
     by_index = make_reader(io.BytesIO(data), validate_crcs=True).iter_messages()
     plain = NonSeekingReader(io.BytesIO(data), validate_crcs=True).iter_messages(
@@ -63,7 +63,7 @@ def test_mcap_package_reads_same_with_index_and_without(log_file: Path) -> None:
     assert times == sorted(times)
 
 
-def test_every_channel_has_a_schema_that_names_every_field(log_file: Path) -> None:
+def test_every_channel_has_a_full_schema(log_file: Path) -> None:
     """Viewers pass over channels without a schema, and take a list on top for many messages."""
     with log_file.open("rb") as stream:
         reader = make_reader(stream)
@@ -102,7 +102,7 @@ def test_every_view_has_exact_numbers(files: dict[str, Path]) -> None:
     assert not shown
 
 
-def test_statistics_and_events_are_the_sites_own(files: dict[str, Path]) -> None:
+def test_statistics_and_events_equal_the_sites(files: dict[str, Path]) -> None:
     log = open_log(files["live"])
     stats = {(site, s.t_ns + EPOCH_NS): s for site in log.sites for s in log.link_stats(site)}
     seen = Counter[str]()
@@ -169,7 +169,7 @@ def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log)
         assert len(others[f"/lab/{site}/link_delay"]) == len(log.link_stats(site))
 
 
-def test_the_bag_keeps_when_every_record_was_sent(files: dict[str, Path], log: Log) -> None:
+def test_the_bag_keeps_publish_times(files: dict[str, Path], log: Log) -> None:
     times: dict[str, list[int]] = defaultdict(list)
     for topic, _, message in decoded(files["bag"], "/"):
         times[topic].append(message.publish_time)
@@ -186,7 +186,7 @@ def test_the_bag_keeps_when_every_record_was_sent(files: dict[str, Path], log: L
             assert times[f"/lab/{site}/{name}"] == log[site].publish_time_ns.tolist()
 
 
-def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
+def test_the_bag_conforms_to_ros_2(files: dict[str, Path]) -> None:
     """Its profile, its types and the qualities of service are those that its tools ask for."""
     with files["bag"].open("rb") as stream:
         reader = make_reader(stream)

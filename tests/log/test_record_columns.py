@@ -123,24 +123,24 @@ def test_a_column_with_an_invalid_value_is_refused(field: str, value: object) ->
 @pytest.mark.parametrize(
     "change", [{"v": 5}, {"v": "3"}, {"tick": -1}, {"tick": 2**40}, {"tick": None}]
 )
-def test_a_record_without_version_or_tick_is_refused_at_once(change: dict[str, object]) -> None:
+def test_records_without_version_or_tick_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(WireError):
         record_columns.decode_ticks([msgpack.packb(GOOD), msgpack.packb({**GOOD, **change})])
 
 
-def test_what_nobody_asks_for_is_not_looked_at() -> None:
+def test_unrequested_fields_are_not_parsed() -> None:
     part = site_log([msgpack.packb({**GOOD, "tau": "no"})])
     assert part.q.tolist() == [[0.5, 0.5]]
     with pytest.raises(Exception, match="record of m1"):
         _ = part.states
 
 
-def test_a_payload_that_is_too_long_is_refused() -> None:
+def test_an_overlong_payload_is_refused() -> None:
     with pytest.raises(WireError, match="oversized"):
         record_columns.decode_ticks([msgpack.packb({**GOOD, "cmd": ["x" * 70_000]})])
 
 
-def test_disordered_records_are_put_in_order_with_their_times() -> None:
+def test_disordered_records_are_sorted_with_their_times() -> None:
     payloads = [msgpack.packb({**GOOD, "tick": tick}) for tick in (4, 2, 3)]
     came = np.array([40, 20, 30])
     part = SiteLog("m1", PEERS, 1000, payloads, "log", (came, came + 1))

@@ -103,7 +103,7 @@ def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Reco
 @given(made_by=LOGS, share=positions)
 @example(made_by=log, share=0.0)
 @example(made_by=earlier_log, share=0.65625)
-def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
+def test_cut_files_keep_every_whole_chunk(
     made_by: Callable[[], bytes], share: float, tmp_path: Path
 ) -> None:
     data = made_by()
@@ -138,7 +138,7 @@ def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
     made_by=LOGS,
     flips=st.lists(st.tuples(positions, st.integers(1, 255)), min_size=1, max_size=3),
 )
-def test_of_damaged_file_every_chunk_that_is_intact_is_kept(
+def test_damaged_files_keep_every_intact_chunk(
     made_by: Callable[[], bytes], flips: list[tuple[float, int]], tmp_path: Path
 ) -> None:
     whole = made_by()
@@ -197,7 +197,7 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
     assert defined[0] == defined[1]
 
 
-def test_what_is_missing_is_counted_afresh_and_named_by_site(tmp_path: Path) -> None:
+def test_missing_records_are_counted_by_site(tmp_path: Path) -> None:
     gone = set(range(30, 50)) | {70}
     data = edited(recorded("paper"), record=without("m2", gone), chunk_bytes=8000)
     result, saved = made(data, tmp_path, "run.mcap")
@@ -210,7 +210,7 @@ def test_what_is_missing_is_counted_afresh_and_named_by_site(tmp_path: Path) -> 
     assert metadata["trilat.recovered"]["missing"] == result.missing[0]
 
 
-def test_a_lost_chunk_is_told_with_its_ticks(tmp_path: Path) -> None:
+def test_lost_chunks_are_reported_with_their_ticks(tmp_path: Path) -> None:
     data = bytearray(log())
     chunk = chunks(log())[5]
     data[(chunk.begin + chunk.end) // 2] ^= 1
@@ -246,7 +246,7 @@ def of_others(compression: CompressionType, chunked: bool) -> bytes:
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("chunked", [True, False])
-def test_a_file_of_anybody_is_recovered_wherever_it_is_cut(
+def test_foreign_files_are_recovered_at_any_cut(
     compression: CompressionType, chunked: bool, tmp_path: Path
 ) -> None:
     data = of_others(compression, chunked)
@@ -274,7 +274,7 @@ def test_a_file_of_anybody_is_recovered_wherever_it_is_cut(
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_the_complete_records_of_a_cut_chunk_are_kept(
+def test_complete_records_of_cut_chunks_are_kept(
     compression: CompressionType, tmp_path: Path
 ) -> None:
     data = foreign([os.urandom(300) for _ in range(2000)], compression=compression)
@@ -311,7 +311,7 @@ META = record(12, struct.pack("<I", 1) + b"m" + bytes(4))
     ],
     ids=["chunk", "attachment", "bomb", "cut bomb", "sizes", "texts"],
 )
-def test_no_number_in_a_file_is_believed(data: bytes, tmp_path: Path) -> None:
+def test_no_number_in_a_file_is_trusted(data: bytes, tmp_path: Path) -> None:
     tracemalloc.start()
     try:
         result, _ = made(data, tmp_path)
@@ -323,9 +323,7 @@ def test_no_number_in_a_file_is_believed(data: bytes, tmp_path: Path) -> None:
 
 @anywhere
 @given(data=st.binary(max_size=300), at=positions)
-def test_whatever_is_in_a_file_it_is_recovered_or_refused(
-    data: bytes, at: float, tmp_path: Path
-) -> None:
+def test_any_file_is_recovered_or_refused(data: bytes, at: float, tmp_path: Path) -> None:
     whole = log()
     place = int(at * len(whole))
     for content in (data, HEAD + data, whole[:place] + data + whole[place:]):
@@ -339,7 +337,7 @@ def test_whatever_is_in_a_file_it_is_recovered_or_refused(
 # Names.
 
 
-def test_a_name_follows_from_that_of_the_file() -> None:
+def test_recovered_names_follow_their_file() -> None:
     names = {
         "run.mcap.active": "run.mcap",
         "run-002.mcap.active": "run-002.mcap",
@@ -350,7 +348,7 @@ def test_a_name_follows_from_that_of_the_file() -> None:
     assert {name: recovered_path(Path("d") / name).name for name in names} == names
 
 
-def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -> None:
+def test_only_permitted_files_are_replaced(tmp_path: Path) -> None:
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(log()[:-100])
     (tmp_path / "run.mcap").write_bytes(b"precious")
@@ -365,7 +363,7 @@ def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("content", [b"", b"no log at all", HEAD])
-def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path: Path) -> None:
+def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(NothingSaved, match="nothing in this file could be saved"):
@@ -391,7 +389,7 @@ def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path
     ],
     ids=["lossless", "lossy", "nothing to save"],
 )
-def test_the_exit_code_says_what_came_of_it(
+def test_exit_codes_give_the_outcome(
     change: Callable[[bytes], bytes], code: int, told: list[str], tmp_path: Path
 ) -> None:
     (tmp_path / "run.mcap.active").write_bytes(change(log()))
@@ -423,7 +421,7 @@ def test_the_exit_code_says_what_came_of_it(
     )
 
 
-def test_a_file_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
+def test_missing_files_are_bad_input(tmp_path: Path) -> None:
     trilat("log", "recover", "none.mcap", cwd=tmp_path).refuses("none.mcap: cannot be read")
 
 

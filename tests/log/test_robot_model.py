@@ -38,7 +38,7 @@ def end_of(model: RobotModel, q) -> tuple:
 
 
 @pytest.mark.parametrize("arm", POSES)
-def test_last_frame_is_where_pinocchio_has_end_of_arm(arm):
+def test_last_frames_equal_pinocchios_end(arm):
     model = RobotModel(scenario(arm), "m")
     reference = chain_references()[arm]
     assert model.frames[-1][1] == f"m/{reference_tip(arm)}"
@@ -68,7 +68,7 @@ def test_bases_stand_apart_and_gravity_points_down(down):
     )
 
 
-def test_a_message_is_read_by_the_decoder_of_ros():
+def test_ros_decoders_read_the_message():
     model = RobotModel(scenario(), "m")
     schema = Schema(
         id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS]
@@ -97,7 +97,7 @@ def test_the_robot_description_has_the_links_and_shapes():
     assert float(arm.find("visual/geometry/cylinder").get("length")) == pytest.approx(0.425)
 
 
-def test_end_of_every_unlike_arm_is_where_its_site_says():
+def test_unlike_arms_end_where_sites_say():
     """A planar arm among chains has a model too, and bases stand where the scenario places them."""
     from trilat_net.scenario import load_scenario
 

@@ -98,7 +98,7 @@ WRONG: dict[str, tuple[bytes, set[str]]] = {
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_what_is_wrong_with_the_file_fails_its_check(kind: str, tmp_path: Path) -> None:
+def test_file_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks = WRONG[kind]
     found = judged(tmp_path, data)
     built = failed(found) & BUILT
@@ -109,7 +109,7 @@ def test_what_is_wrong_with_the_file_fails_its_check(kind: str, tmp_path: Path) 
 
 @settings(max_examples=40)
 @given(st.integers(0, len(WHOLE) - 1), st.integers(0, 7))
-def test_no_bit_of_a_file_can_be_changed_unseen(place: int, bit: int) -> None:
+def test_no_changed_bit_stays_unseen(place: int, bit: int) -> None:
     """Every byte is under a checksum, an index or a rule; what MCAP itself leaves open is said here."""
     found = _of(poked(WHOLE, place, 1 << bit))
     frame = next((f for f in _FRAMES if f.offset <= place < f.end), None)
@@ -182,7 +182,7 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
 
 
 @pytest.mark.parametrize("kind", SAID)
-def test_what_is_wrong_with_the_session_fails_its_check(kind: str, tmp_path: Path) -> None:
+def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks, text = SAID[kind]
     found = judged(tmp_path, data())
     assert failed(found) == checks, found.findings
@@ -200,7 +200,7 @@ def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
     assert "sequence" not in failed(both), both.findings
 
 
-def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
+def test_parts_with_late_records_are_whole(tmp_path: Path) -> None:
     """Nothing is missing over the seams; what a site's memory filled is there, and executes like the rest."""
     parts = split(tmp_path, refilled=range(30, 50))
     assert len(parts) >= 3
@@ -211,7 +211,7 @@ def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
     assert (verdict.records, verdict.identical, verdict.gaps) == (360, 360, [])
 
 
-def test_a_part_alone_is_judged_from_where_it_begins(tmp_path: Path) -> None:
+def test_parts_are_judged_from_their_beginning(tmp_path: Path) -> None:
     """What came before is in the parts before; what it lacks itself is missing all the same."""
     parts = split(tmp_path, refilled=range(0))
     assert check_file(*parts[1:2]).passed
@@ -220,7 +220,7 @@ def test_a_part_alone_is_judged_from_where_it_begins(tmp_path: Path) -> None:
     assert verify(open_log(parts[0], parts[2])).gaps
 
 
-def test_a_recovered_file_is_sound_but_for_what_was_lost(tmp_path: Path) -> None:
+def test_recovered_files_lack_only_lost_records(tmp_path: Path) -> None:
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(DATA[: len(DATA) // 2])
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):
@@ -234,19 +234,19 @@ def test_a_recovered_file_is_sound_but_for_what_was_lost(tmp_path: Path) -> None
     assert verdict.records == sum(len(open_log(torn)[site]) for site in ("m1", "m2", "s"))
 
 
-def test_files_of_different_sessions_are_not_judged_as_one(tmp_path: Path) -> None:
+def test_files_of_different_sessions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="another session"):
         judged(tmp_path, DATA, edited(DATA, session={"session": "other"}))
 
 
-def test_file_of_others_is_judged_by_how_it_is_built(tmp_path: Path) -> None:
+def test_foreign_files_are_judged_by_structure(tmp_path: Path) -> None:
     found = judged(tmp_path, foreign())
     assert found.passed
     assert not found.ours
     assert {finding.check for finding in found.findings} == BUILT
 
 
-def test_what_a_chunk_may_not_hold_is_told(tmp_path: Path) -> None:
+def test_forbidden_chunk_contents_are_reported(tmp_path: Path) -> None:
     """A chunk in a chunk, a message of no channel, a channel that is two things."""
     records = unpack_chunk(RecordScanner(io.BytesIO(DATA)).content(CHUNK))
     lost = struct.pack("<BQHIQQ", 5, 22, 999, 0, 0, 0)
@@ -258,17 +258,17 @@ def test_what_a_chunk_may_not_hold_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"text", MAGIC])
-def test_what_is_no_mcap_file_is_not_sound(data: bytes, tmp_path: Path) -> None:
+def test_files_without_mcap_are_not_sound(data: bytes, tmp_path: Path) -> None:
     assert "whole" in failed(judged(tmp_path, data))
 
 
-def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+def test_missing_files_are_errors(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
         check_file(tmp_path / "none.mcap")
 
 
 @pytest.mark.long
-def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
+def test_pymcap_cli_agrees_about_errors(tmp_path: Path) -> None:
     """Another program, run beside: on how files are built it and we agree."""
     kinds = [
         "a byte of a chunk",
@@ -290,7 +290,7 @@ def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
     assert theirs == ours
 
 
-def test_checksum_of_data_is_compared_where_there_is_one(tmp_path: Path) -> None:
+def test_existing_data_checksums_are_compared(tmp_path: Path) -> None:
     """Our writer makes none; of a file that has one it is told when a byte of the data changed."""
     data = foreign([b"{}"] * 100, enable_data_crcs=True)
     assert judged(tmp_path, data).passed

@@ -40,7 +40,7 @@ counts = st.integers(0, 30)
 
 
 @given(counts, st.lists(st.one_of(st.integers(-35, 35), st.slices(30)), max_size=10))
-def test_records_are_the_list_of_them(count: int, looks: list[int | slice]) -> None:
+def test_site_logs_equal_lists_of_records(count: int, looks: list[int | slice]) -> None:
     payloads = [str(n).encode() for n in range(count)]
     every = decoded(payloads)
     some = LazyRecords(payloads, decoded)
@@ -55,7 +55,7 @@ def test_records_are_the_list_of_them(count: int, looks: list[int | slice]) -> N
             assert some[look] == expected
 
 
-def test_only_the_blocks_looked_at_last_are_held() -> None:
+def test_only_recent_blocks_are_held() -> None:
     asked: list[int] = []
 
     def counted(payloads: Sequence[bytes]) -> list[State]:
@@ -74,9 +74,7 @@ def test_few_records_are_a_list() -> None:
 
 
 @pytest.mark.parametrize("field", ["rx", "echo", "cmd", "mem", "used"])
-def test_records_with_long_lists_are_held_few_at_a_time(
-    field: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_records_are_held_few_at_once(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever list it is, and in either record: memory is bounded by all that a record may hold."""
     monkeypatch.setattr(site_log, "HEAVY_BYTES", 9_000)
     values = {f"m{n}": n for n in range(300)} if field == "used" else [0] * 300
@@ -87,7 +85,7 @@ def test_records_with_long_lists_are_held_few_at_a_time(
 
 
 @given(st.lists(st.integers(0, 20), max_size=20).map(sorted))
-def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
+def test_records_by_tick_equal_their_dictionary(ticks: list[int]) -> None:
     states = [msgspec.structs.replace(state(tick), late_us=n) for n, tick in enumerate(ticks)]
     by_tick = RecordsByTick(states, np.array(ticks, dtype=np.int64))
     assert dict(by_tick) == {s.tick: s for s in states}
@@ -97,7 +95,7 @@ def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
     ]
 
 
-def test_errors_of_orientations_are_turns_as_scipy_has_them() -> None:
+def test_orientation_errors_equal_scipys_turns() -> None:
     rng = np.random.default_rng(5)
     x, x_des = rng.normal(size=(2, 400, 6))
     x_des[:100, 3:] = x[:100, 3:] + 10.0 ** rng.uniform(-12.0, -1.0, (100, 1)) * rng.normal(

@@ -169,7 +169,7 @@ def buckets(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRe
 
 
 @given(runs())
-def test_exactly_every_extreme_of_every_bucket_is_there(records: list[TickRecord]) -> None:
+def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> None:
     """In whatever order the records come."""
     desk = Desk(100.0)
     desk.take(records)
@@ -193,7 +193,7 @@ def test_exactly_every_extreme_of_every_bucket_is_there(records: list[TickRecord
 
 
 @given(runs())
-def test_messages_bear_times_of_records_in_order_of_log_time(records: list[TickRecord]) -> None:
+def test_view_messages_keep_log_time_order(records: list[TickRecord]) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.take(records)
     desk.finish()
@@ -208,7 +208,7 @@ def test_messages_bear_times_of_records_in_order_of_log_time(records: list[TickR
 
 
 @given(runs(), st.randoms(use_true_random=False))
-def test_disorder_within_a_bucket_does_not_show(
+def test_disorder_within_a_bucket_is_invisible(
     records: list[TickRecord], chance: random.Random
 ) -> None:
     in_order = sorted(records, key=lambda one: one.tick)
@@ -221,7 +221,7 @@ def test_disorder_within_a_bucket_does_not_show(
     assert Counter(first) == Counter(second)
 
 
-def test_a_live_view_has_one_message_every_ten_ms() -> None:
+def test_live_views_have_100_messages_a_second() -> None:
     """The second message of a bucket waits half a bucket, so that curves are even over the log time, too."""
     desk = Desk(100.0)
     desk.take(record(k, [float(k)] * 17) for k in range(1000))
@@ -231,7 +231,7 @@ def test_a_live_view_has_one_message_every_ten_ms() -> None:
 
 
 @pytest.mark.parametrize("views_hz", [1000.0, 5000.0, FULL_RATE_HZ])
-def test_full_is_every_record_as_it_was(views_hz: float) -> None:
+def test_full_views_hold_every_record(views_hz: float) -> None:
     records = [record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
     desk = Desk(views_hz)
     desk.take(records)
@@ -242,12 +242,12 @@ def test_full_is_every_record_as_it_was(views_hz: float) -> None:
 
 
 @given(runs())
-def test_record_of_wire_and_one_of_simulation_look_same(records: list[TickRecord]) -> None:
+def test_wire_and_simulated_records_look_equal(records: list[TickRecord]) -> None:
     states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
     assert stack_signals(states) == stack_signals(records)
 
 
-def test_what_waits_is_bounded_by_bucket_and_not_by_silence() -> None:
+def test_waiting_records_are_bounded_by_buckets() -> None:
     """A sender that counts its ticks in leaps, back and forth, leaves nothing behind."""
     desk = Desk(100.0)
     desk.take(record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
@@ -272,7 +272,7 @@ def stats(**facts: Any) -> LinkStats:
     )  # fmt: skip
 
 
-def test_statistics_are_arrays_with_units_and_unmeasured_ones_are_nan() -> None:
+def test_statistics_have_units_and_unmeasured_are_nan() -> None:
     desk = Desk(100.0)
     clocks = {"offset_us": {"s": -2000}, "bound_us": {"s": 40}}
     delays = {"delay_us": {"s": 800}, "delay_max_us": {"s": 2500}}
@@ -296,14 +296,14 @@ def test_statistics_are_arrays_with_units_and_unmeasured_ones_are_nan() -> None:
     assert all(map(math.isnan, by_topic["link_delay"] + by_topic["link_offset"]))
 
 
-def test_virtual_time_has_no_clocks_and_no_network_to_show() -> None:
+def test_virtual_time_shows_no_clocks_or_network() -> None:
     desk = Desk(100.0)
     desk.take([stats()], "trilat/lab/m/link")
     assert [seen.topic for seen in desk.seen] == ["/viz/m/link_age"]
 
 
 @pytest.mark.parametrize(("kind", "level"), [("end", 20), ("lost", 30), ("diverged", 40)])
-def test_event_is_text_and_line_with_level(kind: str, level: int) -> None:
+def test_events_become_text_with_levels(kind: str, level: int) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
     desk.views.receivers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
@@ -323,7 +323,7 @@ def test_event_is_text_and_line_with_level(kind: str, level: int) -> None:
     assert text.publish_ns == text.log_ns == line.publish_ns == line.log_ns == EPOCH_NS + 9
 
 
-def test_event_before_epoch_has_time_of_its_arrival() -> None:
+def test_early_events_have_their_arrival_time() -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.views.receivers["trilat/lab/m/event"](
         Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9
@@ -333,7 +333,7 @@ def test_event_before_epoch_has_time_of_its_arrival() -> None:
     assert stamp.sec * 10**9 + stamp.nanosec == EPOCH_NS - 9
 
 
-def test_logs_own_messages_are_same_with_views_and_without() -> None:
+def test_views_leave_other_messages_unchanged() -> None:
     own, shown = [], []
     for views_hz in (0.0, 100.0):
         stream = io.BytesIO()
@@ -347,7 +347,7 @@ def test_logs_own_messages_are_same_with_views_and_without() -> None:
     assert shown == [False, True]
 
 
-def test_a_part_ends_with_all_that_it_has_seen() -> None:
+def test_parts_end_with_all_extremes() -> None:
     """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
     outputs = [
@@ -382,7 +382,7 @@ def test_a_part_ends_with_all_that_it_has_seen() -> None:
     assert np.array_equal(np.min(shown, axis=0), whole.min(axis=0))
 
 
-def test_an_odd_rate_is_shown_as_often_as_asked() -> None:
+def test_odd_rates_are_shown_as_asked() -> None:
     scenario = load_scenario("two_sites", {"sites.m.rate_hz": 333})
     desk = Desk(100.0, scenario)
     desk.take(record(k, [0.0] * 17) for k in range(333))

@@ -1,4 +1,4 @@
-"""Certificates of a test's own: an authority, and one key for this machine that it has signed."""
+"""Certificates of one test: an authority, and a key for this machine that the authority has signed."""
 
 import shutil
 import subprocess

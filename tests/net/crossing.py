@@ -1,4 +1,4 @@
-"""Two clocks and a network between them that a test makes up: what each reads is known, so the truth is."""
+"""Two clocks and a network between them, made up by a test: readings and truth are known."""
 
 import random
 from collections.abc import Callable
@@ -11,7 +11,7 @@ Delay = Callable[[random.Random], int]
 
 
 def queueing(floor_us: float, mean_us: float) -> Delay:
-    """A way that takes at least so long, and waits in queues besides."""
+    """A way with a minimum delay and random queues."""
     return lambda rnd: int(1000 * (floor_us + rnd.expovariate(1.0 / mean_us)))
 
 
@@ -29,28 +29,32 @@ class Other:
 
 
 def ceiling(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
-    """What a message from here says that took so long."""
+    """Returns the bound that a message sent from here gives, for its travel time."""
     return OffsetLimit(sent_ns, other.reads(sent_ns + delay_ns) - sent_ns)
 
 
 def floor(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
-    """What a message from there says that was sent at an instant of the own clock and took so long."""
+    """Returns the bound that a message sent from there gives, for an instant of the own clock
+    and its travel time.
+    """
     return OffsetLimit(sent_ns + delay_ns, other.reads(sent_ns) - sent_ns - delay_ns)
 
 
 def second(
     other: Other,
     begin_ns: int,
-    there: Delay,
+    way: Delay,
     back: Delay,
     rnd: random.Random,
     messages: int = 50,
 ) -> tuple[OffsetLimit, OffsetLimit]:
-    """The tightest of a second of messages both ways, all of which have come before it is over."""
+    """Returns the tightest bounds of a second of messages both ways, all of which have arrived
+    within that second.
+    """
     ceilings, floors = [], []
     for n in range(messages):
         at_ns = begin_ns + n * (S // 2) // messages
-        ceilings.append(ceiling(other, at_ns, there(rnd)))
+        ceilings.append(ceiling(other, at_ns, way(rnd)))
         floors.append(floor(other, at_ns, back(rnd)))
     level = lambda limit: limit.offset_ns - other.drift_ppb * limit.local_ns / S  # noqa: E731
     return min(ceilings, key=level), max(floors, key=level)

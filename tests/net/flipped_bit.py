@@ -21,7 +21,7 @@ from .waiting import drained, until
 
 
 class Flipping:
-    """A wire to a place that turns over a bit of what passes there, if asked."""
+    """A wire to a place that turns over one bit of its traffic on request."""
 
     def __init__(self, to: str) -> None:
         self._to = ("127.0.0.1", int(to.rpartition(":")[2]))
@@ -69,9 +69,11 @@ class Flipping:
 
 
 def main(folder: Path) -> None:
-    (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
-    receiver = ZenohBus([place], settings=read_member_keys(folder / "m1").settings)
-    wire = Flipping(place)
+    (endpoint,) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
+    )
+    receiver = ZenohBus([endpoint], settings=read_member_keys(folder / "m1").settings)
+    wire = Flipping(endpoint)
     sender = ZenohBus([], [wire.place], settings=read_member_keys(folder / "m2").settings)
     key = topics.key("x", "m2", topics.EVENT)
     try:
@@ -79,9 +81,9 @@ def main(folder: Path) -> None:
 
         def comes() -> bool:
             say(b"true")
-            came = [payload.decode() for _, payload in drained(inbox)]
-            print(*came, flush=True)
-            return "true" in came
+            payloads = [payload.decode() for _, payload in drained(inbox)]
+            print(*payloads, flush=True)
+            return "true" in payloads
 
         until(comes)
         before, wire.flips = wire.connections, 1

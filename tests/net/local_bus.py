@@ -45,7 +45,7 @@ class LocalBus:
         self._tokens: list[str] = []
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
-        """See `Bus`; there is always room."""
+        """See `Bus`; the queue always has room."""
 
         def publish(payload: bytes) -> None:
             for member in self._network.members:

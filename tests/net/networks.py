@@ -1,4 +1,4 @@
-"""The networks that keep the contract of `Bus`, behind one face for the tests."""
+"""The networks that fulfil the contract of `Bus`, with one interface for the tests."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ SEATS = 3
 
 class Network(Protocol):
     def join(self) -> Bus:
-        """The connection of a new member, which has met those before it."""
+        """Returns the connection of a new member, which has met the earlier members."""
 
     def close(self) -> None:
         """All members leave."""
@@ -85,19 +85,19 @@ class Routed(Connected):
 
 
 def encrypted(protocol: str, folder: Path) -> Mesh:
-    """A mesh whose members prove to each other who they are, by a person's own configuration."""
+    """Returns a mesh whose members authenticate each other, by a person's own configuration."""
     return Mesh(protocol, read_zenoh_file(Certificates(folder).zenoh_file()).settings)
 
 
 def greet(newcomer: Bus, members: Sequence[Bus]) -> None:
-    """Returns once a newcomer is heard by those who were there before."""
+    """Returns once the earlier members hear a newcomer."""
     greeting = newcomer.publisher("greeting")
     for member in members:
         meet(greeting, member, "greeting")
 
 
 def meet(publish: Callable[[bytes], None], receiver: Bus, key: str) -> None:
-    """Returns once what is published reaches a receiver."""
+    """Returns once published messages reach a receiver."""
     inbox = receiver.inbox(key)
 
     def heard() -> bool:

@@ -23,19 +23,19 @@ HASH = "5c" * 32
 CLOCK = ManualClock().identity()
 
 
-def told(name: str, boot: int, **facts: object) -> Info:
-    """What a member answers when asked who it is; `facts` override."""
+def answer_info(name: str, boot: int, **facts: object) -> Info:
+    """Returns a member's answer about its identity; `facts` override."""
     recorder = name == topics.RECORDER
-    own = {
+    info_facts = {
         "scenario_sha256": "" if recorder else HASH,
         "scenario": "" if recorder else "the scenario",
     }
-    own |= {"host": "h", "clock": CLOCK, "fingerprint": "f"}
-    return Info(**{"member": name, "boot": boot, **own, **facts})
+    info_facts |= {"host": "h", "clock": CLOCK, "fingerprint": "f"}
+    return Info(**{"member": name, "boot": boot, **info_facts, **facts})
 
 
 class Elsewhere(ManualClock):
-    """The clock of another machine: both of its readings are other ones than here."""
+    """The clock of another machine: both of its readings differ from those here."""
 
     def __init__(self, start_ns: int, unix_ns: int, name: str) -> None:
         super().__init__(start_ns, unix_ns)
@@ -54,7 +54,7 @@ class Member:
         self.joining = SessionJoin(bus, clock, SESSION, self.publisher, sites)
 
     def poll(self) -> None:
-        """One round of what a process does: join, and once it has the epoch, answer."""
+        """Polls once as a process does: joins, and answers once it has the epoch."""
         if self.epoch is None:
             self.epoch = self.joining.poll()
             if self.epoch is not None:
@@ -70,7 +70,7 @@ class Member:
 
 
 class Party:
-    """A session's network, its clock, its present members, and all events that were said."""
+    """A session's network, its clock, its present members, and all events so far."""
 
     def __init__(self, sites: Sequence[str]) -> None:
         self.sites = tuple(sites)
@@ -84,17 +84,17 @@ class Party:
         self._boot = 100
 
     def elsewhere(self, ahead_ns: int, unix_ns: int = 0, name: str = "elsewhere") -> Elsewhere:
-        """The clock of another machine, which goes on as the one here does."""
-        made = Elsewhere(self.clock.monotonic_ns() + ahead_ns, unix_ns, name)
-        self._clocks.append(made)
-        return made
+        """Returns the clock of another machine, which advances like the one here."""
+        clock = Elsewhere(self.clock.monotonic_ns() + ahead_ns, unix_ns, name)
+        self._clocks.append(clock)
+        return clock
 
     def member(self, name: str, **facts: object) -> Member:
         self._boot += 1
         clock = facts.pop("on_clock", self.clock)
         sites = () if name == topics.RECORDER else self.sites
         facts = {"boot": self._boot, "clock": clock.identity(), **facts}
-        return Member(self.network.join(), clock, sites, told(name, **facts))
+        return Member(self.network.join(), clock, sites, answer_info(name, **facts))
 
     def start(self, *names: str, **facts: object) -> None:
         for name in names:
@@ -126,7 +126,7 @@ class Party:
             self.round()
 
     def agreed(self, within_s: float = 5.0) -> Epoch:
-        """Lets all poll until each has its epoch; returns the one that they agree on."""
+        """Lets all members poll until each has its epoch; returns the epoch on which all agree."""
         for _ in range(int(within_s * 1e9) // STEP_NS):
             if all(member.epoch for member in self.members.values()):
                 break

@@ -1,4 +1,4 @@
-"""The contract of `Bus`, kept by the real one and by its fake."""
+"""The contract of `Bus`, fulfilled by the real bus and by its fake."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,16 +11,16 @@ from trilat_net.net.bus import Bus, Inbox, StampedInbox, StampingRing
 
 from .local_bus import LocalNetwork
 from .networks import NETWORKS, Network
-from .waiting import answered, drained, received, until
+from .waiting import drained, query_once, received, until
 
 
 @pytest.fixture(
     params=[pytest.param(name, marks=[pytest.mark.long] * (name == "tls")) for name in NETWORKS]
 )
 def network(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Network]:
-    made = NETWORKS[request.param](tmp_path)
-    yield made
-    made.close()
+    member_network = NETWORKS[request.param](tmp_path)
+    yield member_network
+    member_network.close()
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def opened(publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[byte
 NUMBERS = [n.to_bytes(2, "big") for n in range(500)]
 
 
-def test_a_ring_gives_what_others_published_in_their_order(pair: tuple[Bus, Bus]) -> None:
+def test_rings_give_messages_in_order(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
     opened(publish, inbox)
@@ -54,7 +54,7 @@ def test_a_ring_gives_what_others_published_in_their_order(pair: tuple[Bus, Bus]
     assert received(inbox, len(NUMBERS)) == [("t/a", number) for number in NUMBERS]
 
 
-def test_an_expression_stands_for_many_keys_and_no_others(pair: tuple[Bus, Bus]) -> None:
+def test_expressions_match_only_their_keys(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     one, any_number = receiver.inbox("t/*/x"), receiver.inbox("t/**")
     publishers = {
@@ -68,7 +68,7 @@ def test_an_expression_stands_for_many_keys_and_no_others(pair: tuple[Bus, Bus])
     assert [key for key, _ in received(any_number, 4)] == ["t/b/y", "t/a/x", "t/b/b/x", "t/b/x"]
 
 
-def test_own_messages_never_come_back(pair: tuple[Bus, Bus]) -> None:
+def test_own_messages_never_return(pair: tuple[Bus, Bus]) -> None:
     sender, other = pair
     own, theirs, publish = sender.inbox("t/a"), other.inbox("t/a"), sender.publisher("t/a")
     opened(publish, theirs)
@@ -79,7 +79,7 @@ def test_own_messages_never_come_back(pair: tuple[Bus, Bus]) -> None:
     assert received(theirs, 1) == [("t/a", b"mine")]
 
 
-def test_a_tap_is_called_with_every_message_in_order(pair: tuple[Bus, Bus]) -> None:
+def test_taps_get_every_message_in_order(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     heard: list[tuple[str, bytes]] = []
     inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
@@ -93,10 +93,10 @@ def test_a_tap_is_called_with_every_message_in_order(pair: tuple[Bus, Bus]) -> N
     assert heard == [("t/a", number) for number in NUMBERS]
 
 
-def test_patient_publisher_loses_nothing_however_much_it_has_to_say(
+def test_patient_publishers_lose_nothing(
     pair: tuple[Bus, Bus],
 ) -> None:
-    """Several times what a connection holds; who takes it is slower."""
+    """A multiple of the connection's capacity; the receiver is slower."""
     sender, receiver = pair
     heard: list[bytes] = []
     inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a", patient=True)
@@ -111,7 +111,7 @@ def test_patient_publisher_loses_nothing_however_much_it_has_to_say(
     assert heard == said
 
 
-def test_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus, Bus]) -> None:
+def test_full_rings_lose_only_their_oldest(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     small, large, publish = (
         receiver.inbox("t/a", 16),
@@ -126,7 +126,7 @@ def test_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus
     assert kept == NUMBERS[-16:]
 
 
-def test_everyone_who_answers_is_heard_once(network: Network) -> None:
+def test_every_answer_is_heard_once(network: Network) -> None:
     asker, *others = (network.join() for _ in range(3))
     rings = {
         name: bus.query_inbox(f"t/{name}/info") for name, bus in zip("ab", others, strict=True)
@@ -152,7 +152,7 @@ def test_everyone_who_answers_is_heard_once(network: Network) -> None:
     assert sorted(until(answers)) == [("t/a/info", b"a"), ("t/b/info", b"b")]
 
 
-def test_a_question_carries_what_was_sent_with_it(pair: tuple[Bus, Bus]) -> None:
+def test_questions_carry_their_payload(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
     questions = other.query_inbox("t/a/info")
     for sent in (b"", b"\x00\xff" * 2000, b"again"):
@@ -166,16 +166,16 @@ def test_a_question_carries_what_was_sent_with_it(pair: tuple[Bus, Bus]) -> None
         until(asked)
 
 
-def test_a_responder_answers_at_once_while_nobody_polls(pair: tuple[Bus, Bus]) -> None:
+def test_responders_answer_at_once_without_polling(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
     other.respond("t/a/ping", lambda sent: sent[::-1])
-    assert until(lambda: answered(asker, "t/*/ping", b"123")) == ("t/a/ping", b"321")
+    assert until(lambda: query_once(asker, "t/*/ping", b"123")) == ("t/a/ping", b"321")
 
 
-def test_responder_may_keep_silent_and_then_only_others_are_heard(network: Network) -> None:
+def test_silent_responders_let_others_be_heard(network: Network) -> None:
     asker, silent, other = (network.join() for _ in range(3))
-    asked: list[bytes] = []
-    silent.respond("t/a/ping", asked.append)
+    questions: list[bytes] = []
+    silent.respond("t/a/ping", questions.append)
     other.respond("t/b/ping", lambda _: b"here")
     heard: list[tuple[str, bytes]] = []
     pending: list[Inbox] = []
@@ -184,14 +184,14 @@ def test_responder_may_keep_silent_and_then_only_others_are_heard(network: Netwo
         pending.append(asker.query("t/*/ping", b"?"))
         for replies in pending:
             heard.extend(drained(replies))
-        return bool(asked and heard)
+        return bool(questions and heard)
 
     until(both)
-    assert set(asked) == {b"?"}
+    assert set(questions) == {b"?"}
     assert set(heard) == {("t/b/ping", b"here")}
 
 
-def test_nobody_answers_oneself(pair: tuple[Bus, Bus]) -> None:
+def test_no_member_answers_itself(pair: tuple[Bus, Bus]) -> None:
     own, other = pair
     own.respond("t/a/ping", lambda _: b"own")
     own_questions = own.query_inbox("t/b/ping")
@@ -209,7 +209,7 @@ def test_nobody_answers_oneself(pair: tuple[Bus, Bus]) -> None:
 
 
 class Ticking:
-    """A clock whose every reading is one more than the one before."""
+    """A clock whose every reading is one more than the last."""
 
     def __init__(self) -> None:
         self.readings = 0
@@ -219,7 +219,7 @@ class Ticking:
         return self.readings
 
 
-def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> None:
+def test_every_message_is_stamped_once_at_arrival(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     clock = Ticking()
     inbox, publish = receiver.stamped_inbox("t/a", clock, bytes), sender.publisher("t/a")
@@ -232,7 +232,7 @@ def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> Non
     assert inbox.poll() is None
 
 
-def test_stamped_ring_that_is_full_loses_the_oldest(pair: tuple[Bus, Bus]) -> None:
+def test_full_stamped_rings_lose_the_oldest(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     inbox, publish = (
         receiver.stamped_inbox("t/a", Ticking(), bytes, 16),
@@ -249,7 +249,7 @@ def test_stamped_ring_that_is_full_loses_the_oldest(pair: tuple[Bus, Bus]) -> No
 
 
 @given(capacity=st.integers(1, 5), takes=st.lists(st.booleans(), max_size=60))
-def test_a_stamped_message_is_polled_waits_or_is_the_oldest(
+def test_stamped_messages_are_polled_waiting_or_oldest(
     capacity: int, takes: list[bool]
 ) -> None:
     ring = StampingRing(Ticking(), bytes, capacity)
@@ -266,7 +266,7 @@ def test_a_stamped_message_is_polled_waits_or_is_the_oldest(
             assert ring.poll() == (first and (bytes([first]), first))
 
 
-def test_an_answer_after_the_asker_has_gone_harms_nobody(pair: tuple[Bus, Bus]) -> None:
+def test_late_answers_harm_nobody(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
     questions = other.query_inbox("t/a/info")
 
@@ -291,7 +291,7 @@ def test_tokens_appear_and_disappear_with_their_member(pair: tuple[Bus, Bus]) ->
     assert presence.poll() is None
 
 
-def test_tokens_that_stand_already_come_first(pair: tuple[Bus, Bus]) -> None:
+def test_existing_tokens_come_first(pair: tuple[Bus, Bus]) -> None:
     early, late = pair
     early.announce("t/a/alive/1")
     presence = late.presence("t/*/alive/*")
@@ -300,7 +300,7 @@ def test_tokens_that_stand_already_come_first(pair: tuple[Bus, Bus]) -> None:
     assert until(presence.poll) == ("t/b/alive/2", True)
 
 
-def test_a_member_does_not_see_its_own_token(pair: tuple[Bus, Bus]) -> None:
+def test_members_do_not_see_their_own_token(pair: tuple[Bus, Bus]) -> None:
     own, other = pair
     presence = own.presence("t/*/alive/*")
     own.announce("t/a/alive/1")
@@ -308,7 +308,7 @@ def test_a_member_does_not_see_its_own_token(pair: tuple[Bus, Bus]) -> None:
     assert until(presence.poll) == ("t/b/alive/2", True)
 
 
-def test_rings_with_nothing_in_them_give_none(network: Network) -> None:
+def test_empty_rings_give_none(network: Network) -> None:
     bus = network.join()
     rings = [bus.inbox("t/a"), bus.presence("t/*"), bus.query_inbox("t/info"), bus.query("t/*")]
     assert [ring.poll() for ring in rings for _ in range(3)] == [None] * 12
@@ -320,7 +320,7 @@ def test_leaving_twice_is_leaving_once(pair: tuple[Bus, Bus]) -> None:
 
 
 def test_members_of_two_networks_never_meet() -> None:
-    one, other = LocalNetwork().join(), LocalNetwork().join()
+    first, other = LocalNetwork().join(), LocalNetwork().join()
     inbox = other.inbox("**")
-    one.publisher("t/a")(b"1")
+    first.publisher("t/a")(b"1")
     assert inbox.poll() is None

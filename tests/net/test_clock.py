@@ -1,4 +1,4 @@
-"""One contract for the machine's clocks, the one that a test moves, and one that runs beside another."""
+"""One contract for the machine's clocks, a test's manual clock, and a skewed clock."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ def clock(request: pytest.FixtureRequest) -> Clock:
     return CLOCKS[request.param]()
 
 
-def test_it_never_goes_back_and_wall_clock_goes_with_it(clock: Clock) -> None:
+def test_clocks_never_go_back_and_agree(clock: Clock) -> None:
     readings = [clock.monotonic_ns() for _ in range(100)]
     assert readings == sorted(readings)
     unix_ns = clock.unix_ns()
@@ -72,7 +72,7 @@ def test_a_signal_does_not_shorten_a_sleep() -> None:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_the_clock_is_not_the_coarse_one_of_windows() -> None:
+def test_windows_clocks_have_fine_resolution() -> None:
     """Python 3.12 reads GetTickCount64 for `monotonic` on Windows, which goes in steps of 16 ms."""
     fine, coarse = time.get_clock_info("perf_counter"), time.get_clock_info("monotonic")
     assert SystemClock.monotonic_ns is time.perf_counter_ns
@@ -104,9 +104,7 @@ def test_a_skewed_clock_has_its_offset_and_drift(
 
 
 @given(skews, st.integers(1, 10**12))
-def test_sleeping_on_skewed_clock_ends_at_its_deadline_to_nanosecond(
-    skew: tuple[int, int], ahead_ns: int
-) -> None:
+def test_sleeping_on_skewed_clocks_ends_exactly(skew: tuple[int, int], ahead_ns: int) -> None:
     true = ManualClock(10**9)
     clock = SkewedClock(true, *skew)
     deadline_ns = clock.monotonic_ns() + ahead_ns
@@ -114,7 +112,7 @@ def test_sleeping_on_skewed_clock_ends_at_its_deadline_to_nanosecond(
     assert 0 <= clock.monotonic_ns() - deadline_ns <= 1
 
 
-def test_a_skewed_clock_says_its_skew_and_stays_itself() -> None:
+def test_skewed_clocks_state_their_skew() -> None:
     true = ManualClock(40)
     clocks = [SkewedClock(true, 0, 0), SkewedClock(true, 1, 0), SkewedClock(true, 0, 1)]
     true.sleep_until(41)
@@ -124,7 +122,7 @@ def test_a_skewed_clock_says_its_skew_and_stays_itself() -> None:
     assert {clock.unix_ns() for clock in clocks} == {true.unix_ns()}
 
 
-def test_machines_clock_is_skewed_only_where_it_is_asked_for() -> None:
+def test_machine_clocks_are_skewed_only_on_request() -> None:
     assert type(make_system_clock()) is SystemClock
     clock = make_system_clock(1.5, -20.5)
     assert "skewed by 1500000000 ns and -20500 ns/s since" in clock.identity()

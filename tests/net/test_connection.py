@@ -46,14 +46,14 @@ def member(
     return resolve_member_connection(listen, connect, routers, own, HERE, THERE)
 
 
-def test_who_names_nothing_is_on_this_machine() -> None:
+def test_defaults_stay_on_this_machine() -> None:
     assert member() == Connection(HERE, THERE, "peer", {})
     assert member(own=file(namespace="n")) == Connection(
         HERE, THERE, "peer", {"namespace": "n"}
     )
 
 
-def test_place_that_is_named_replaces_one_on_this_machine() -> None:
+def test_named_places_replace_the_local_ones() -> None:
     assert member(listen=[A]) == Connection([A], THERE)
     assert member(connect=[A, B]) == Connection(HERE, [A, B])
     assert member(listen=[], connect=[]) == Connection([], [])
@@ -66,7 +66,7 @@ def test_place_that_is_named_replaces_one_on_this_machine() -> None:
     ]
 
 
-def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None:
+def test_clients_of_routers_listen_nowhere() -> None:
     assert member(routers=[A, B]) == Connection((), [A, B], "client", {})
     stated = file(mode="client", connect={"endpoints": [C]})
     assert member(routers=[A], own=stated) == Connection((), [A, C], "client", {"connect": {}})
@@ -116,7 +116,7 @@ def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None
         ),
     ],
 )
-def test_what_contradicts_itself_is_refused(arguments: dict[str, object], problem: str) -> None:
+def test_contradictions_are_refused(arguments: dict[str, object], problem: str) -> None:
     with pytest.raises(UsageError, match=problem):
         member(**arguments)
 
@@ -131,20 +131,20 @@ def test_what_contradicts_itself_is_refused(arguments: dict[str, object], proble
         "unixsock-stream//run/zenoh.sock",
     ],
 )
-def test_a_router_may_be_anywhere_that_zenoh_reaches(endpoint: str) -> None:
+def test_any_address_of_zenoh_may_be_a_router(endpoint: str) -> None:
     assert member(routers=[endpoint]).connect == [endpoint]
 
 
 def router(
-    listen: list[str] | None, connect: list[str] | None, own: ZenohFile | None
+    listen: list[str] | None, connect: list[str] | None, zenoh_file: ZenohFile | None
 ) -> Connection:
-    return resolve_member_connection(listen, connect, None, own, HERE, routes=True)
+    return resolve_member_connection(listen, connect, None, zenoh_file, HERE, routes=True)
 
 
-def test_a_router_listens_and_connects_as_told() -> None:
+def test_routers_listen_and_connect_as_configured() -> None:
     assert router(None, None, None) == Connection(HERE, (), "router", {})
-    told = router([A], [B], file(mode="router"))
-    assert told == Connection([A], [B], "router", {})
+    lines = router([A], [B], file(mode="router"))
+    assert lines == Connection([A], [B], "router", {})
     places = {"router": [C], "peer": [B]}
     assert router(None, None, file(listen={"endpoints": places})).listen == [C]
     for mode in ("peer", "client"):
@@ -155,7 +155,7 @@ def test_a_router_listens_and_connects_as_told() -> None:
 
 
 class Answering(ManualClock):
-    """A clock on which a router comes, or a signal, after a number of sleeps."""
+    """A clock on which a router appears, or a signal, after a number of sleeps."""
 
     def __init__(
         self, endpoints: list[str], comes_after: int = 0, stops_after: int = 0
@@ -179,7 +179,7 @@ class Answering(ManualClock):
         return 0 < self._stops_after <= self.sleeps
 
 
-def test_a_router_that_comes_later_is_waited_for() -> None:
+def test_late_routers_are_awaited() -> None:
     endpoints = find_free_endpoints(1)
     clock, said = Answering(endpoints, comes_after=3), []
     bus = open_bus(Connection((), endpoints, "client"), clock, clock.stopped, 5.0, said.append)
@@ -191,7 +191,7 @@ def test_a_router_that_comes_later_is_waited_for() -> None:
     assert said == [f"no router answers at {endpoints[0]} yet; trying again"]
 
 
-def test_router_that_never_comes_is_said_and_signal_ends_waiting() -> None:
+def test_missing_routers_are_reported_and_signals_end_waiting() -> None:
     endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
     connection = Connection((), endpoints, "client")
@@ -204,7 +204,7 @@ def test_router_that_never_comes_is_said_and_signal_ends_waiting() -> None:
     assert clock.sleeps == 4
 
 
-def test_a_peer_waits_for_nobody() -> None:
+def test_peers_wait_for_nobody() -> None:
     endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
     bus = open_bus(
@@ -219,32 +219,30 @@ NAMES = st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=
 
 
 def port(endpoint: str) -> int:
-    found = re.fullmatch(r"tcp/127\.0\.0\.1:(\d+)", endpoint)
-    assert found, endpoint
-    return int(found[1])
+    match = re.fullmatch(r"tcp/127\.0\.0\.1:(\d+)", endpoint)
+    assert match, endpoint
+    return int(match[1])
 
 
 @given(NAMES, st.integers(0, 1000))
-def test_defaults_are_unprivileged_loopback_ports_below_the_ephemeral_ones(
-    session: str, index: int
-) -> None:
+def test_default_ports_are_below_the_ephemeral_ones(session: str, index: int) -> None:
     assert 1024 <= port(default_endpoint(session, index)) < 32_768
 
 
 @given(NAMES, st.lists(NAMES, min_size=2, max_size=64, unique=True))
-def test_sites_of_a_session_have_endpoints_of_their_own(session: str, sites: list[str]) -> None:
+def test_sites_have_endpoints_of_their_own(session: str, sites: list[str]) -> None:
     places = default_endpoints(session, sites)
     assert list(places) == sites
     assert len(set(places.values())) == len(sites)
     assert places[sites[0]] == default_endpoint(session, 0)
 
 
-def test_they_are_a_published_function_of_session_and_site() -> None:
+def test_endpoints_are_a_published_function() -> None:
     assert default_endpoint("paper", 0) == "tcp/127.0.0.1:24448"
     assert default_endpoint("paper", 2) == "tcp/127.0.0.1:24450"
 
 
-def test_free_endpoints_can_be_listened_at_all_at_once() -> None:
+def test_free_endpoints_can_be_used_together() -> None:
     endpoints = find_free_endpoints(8)
     assert len(set(endpoints)) == 8
     with ExitStack() as stack:
@@ -252,12 +250,12 @@ def test_free_endpoints_can_be_listened_at_all_at_once() -> None:
             stack.enter_context(socket.socket()).bind(("127.0.0.1", port(endpoint)))
 
 
-def test_a_session_keeps_its_ports_unless_one_is_taken() -> None:
-    """So that `trilat set` and `trilat ping` find it without being told."""
+def test_sessions_keep_free_ports() -> None:
+    """So that `trilat set` and `trilat ping` find the session without its ports."""
     sites = ("a", "b", "c")
     places = list(default_endpoints("endpoints-test", sites).values())
-    with reserve_session_endpoints("endpoints-test", sites) as own:
-        assert own == places
+    with reserve_session_endpoints("endpoints-test", sites) as reserved:
+        assert reserved == places
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port(places[1])))
         taken.listen()
@@ -266,8 +264,8 @@ def test_a_session_keeps_its_ports_unless_one_is_taken() -> None:
             assert not set(others) & set(places)
 
 
-def test_two_sessions_of_one_name_get_their_own_ports() -> None:
-    """Each keeps what it chose, and its sites can listen there all the same."""
+def test_namesake_sessions_get_their_own_ports() -> None:
+    """Each keeps its choice, and its sites can listen there all the same."""
     sites = ("a", "b", "c")
     with ExitStack() as stack:
         chosen = [
@@ -276,12 +274,12 @@ def test_two_sessions_of_one_name_get_their_own_ports() -> None:
         ]
         places = list(chain.from_iterable(chosen))
         assert len(set(places)) == 9
-        for place in places:
-            stack.enter_context(closing(ZenohBus([place])))
+        for endpoint in places:
+            stack.enter_context(closing(ZenohBus([endpoint])))
 
 
 class Played(ManualClock):
-    """A clock on which things happen, each after one more sleep; then the router is stopped."""
+    """A clock on which events happen, each after one more sleep; then the router is stopped."""
 
     def __init__(self, *events: Callable[[], object], rest: int = 0) -> None:
         super().__init__()
@@ -313,11 +311,11 @@ def announced(network: LocalNetwork, key: str) -> Bus:
     return bus
 
 
-def test_it_says_who_comes_and_goes_in_every_session() -> None:
+def test_routers_report_members_in_every_session() -> None:
     network = LocalNetwork()
-    there = announced(network, "trilat/one/m1/alive/1")
+    other_token = announced(network, "trilat/one/m1/alive/1")
     announced(network, "other/one/m1/alive/1")
-    clock = Played(lambda: announced(network, "trilat/two/s/alive/2"), there.close)
+    clock = Played(lambda: announced(network, "trilat/two/s/alive/2"), other_token.close)
     assert routed(clock, network) == [
         "session one: m1 is here",
         "session two: s is here",
@@ -325,8 +323,8 @@ def test_it_says_who_comes_and_goes_in_every_session() -> None:
     ]
 
 
-def test_two_starts_of_one_member_count_as_two() -> None:
-    """A token may be heard twice, as after a link that healed; it is said once."""
+def test_two_starts_of_a_member_count_twice() -> None:
+    """A token may be heard twice, as after a link that healed; it is reported once."""
     network = LocalNetwork()
     first = announced(network, "trilat/t/m1/alive/1")
     clock = Played(
@@ -364,7 +362,7 @@ def test_a_router_stays_until_all_members_have_left() -> None:
 
 def test_without_a_time_it_stays_for_ever() -> None:
     network = LocalNetwork()
-    there = announced(network, "trilat/t/m1/alive/1")
-    clock = Played(there.close, rest=1000)
+    other_token = announced(network, "trilat/t/m1/alive/1")
+    clock = Played(other_token.close, rest=1000)
     routed(clock, network)
     assert clock.over

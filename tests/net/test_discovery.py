@@ -1,4 +1,4 @@
-"""Members of a session are found and connected to, and asked for changes over real connections."""
+"""Members of a session are found and connected to, and take changes over real connections."""
 
 import threading
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
 
 from .local_bus import LocalNetwork
-from .parties import told
+from .parties import answer_info
 from .waiting import until
 
 SESSION = "o"
@@ -35,7 +35,7 @@ class Answering:
         (self.endpoint,) = find_free_endpoints(1)
         self._bus = ZenohBus([self.endpoint])
         scenario = load_scenario("paper")
-        info = told(
+        info = answer_info(
             "s", 1, scenario_sha256=scenario.sha256, scenario=scenario.text, running=running
         )
         self._publisher = EventPublisher(self._bus, SESSION, info)
@@ -73,7 +73,7 @@ def running() -> Iterator[Answering]:
         yield site
 
 
-def test_change_is_answered_by_site_that_carries_it_out(running: Answering) -> None:
+def test_the_affected_site_answers_a_change(running: Answering) -> None:
     reply = running.asked("s", link="m1->s", to={"delay_ms": 350.0})
     assert (reply.member, reply.accepted, reply.tick) == ("s", True, 200)
     refused = running.asked("s", link="m1->s", to={"delay_ms": -1.0})
@@ -81,17 +81,17 @@ def test_change_is_answered_by_site_that_carries_it_out(running: Answering) -> N
     assert "delay_ms" in refused.text
 
 
-def test_a_site_that_does_not_exist_is_told_the_others(running: Answering) -> None:
+def test_changes_for_unknown_sites_name_the_others(running: Answering) -> None:
     with pytest.raises(SessionError, match="m1, m2, s"):
         running.asked("x", dominance="x", to={"m1": 1.0})
 
 
-def test_site_of_scenario_that_is_not_there_does_not_answer(running: Answering) -> None:
+def test_absent_sites_do_not_answer(running: Answering) -> None:
     with pytest.raises(SessionError, match="'m1' of session 'o' does not answer"):
         running.asked("m1", dominance="m1", to={"s": 1.0})
 
 
-def test_a_session_that_has_not_begun_takes_no_changes() -> None:
+def test_sessions_take_no_changes_before_their_start() -> None:
     with (
         closing(Answering(running=False)) as site,
         pytest.raises(SessionError, match="has not begun"),
@@ -99,7 +99,7 @@ def test_a_session_that_has_not_begun_takes_no_changes() -> None:
         site.asked("s", link="m1->s", to={"delay_ms": 350.0})
 
 
-def test_whoever_gives_no_answer_is_named() -> None:
+def test_silent_members_are_named() -> None:
     with (
         closing(Answering(running=True, deaf=True)) as site,
         pytest.raises(SessionError, match="s did not answer"),
@@ -117,26 +117,26 @@ def find(*payloads: bytes) -> list[Info]:
     return list(find_members(asker, clock, SESSION, stopped=lambda: False, timeout_s=0.5))
 
 
-def test_members_are_found_again_and_again_beside_unreadable_answers() -> None:
-    found = find(encode(told("m0", 1)), b"garbage")
-    assert {info.member for info in found} == {"m0"}
-    assert len(found) >= 2
+def test_members_are_found_despite_unreadable_answers() -> None:
+    members = find(encode(answer_info("m0", 1)), b"garbage")
+    assert {info.member for info in members} == {"m0"}
+    assert len(members) >= 2
     assert find() == []
 
 
-def test_answers_of_another_version_alone_are_error_that_names_member() -> None:
+def test_answers_of_other_versions_name_their_member() -> None:
     with pytest.raises(
         SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
     ):
-        find(encode(told("m0", 1, v=VERSION + 1)))
+        find(encode(answer_info("m0", 1, v=VERSION + 1)))
 
 
-def test_recorder_announces_itself_while_it_asks_first_site_for_others() -> None:
+def test_waiting_recorders_announce_themselves_first() -> None:
     session = f"discovery-{CLOCK.monotonic_ns()}"
     first = ZenohBus([default_endpoint(session, 0)])
     presence = first.presence(topics.presence_key(session, "*"))
     scenario = load_scenario("two_sites")
-    info = told("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)
+    info = answer_info("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)
     first.respond(topics.key(session, "m", topics.INFO), lambda _: encode(info))
     patience = {"stopped": lambda: False, "timeout_s": 10.0, "recorder_boot": 7}
     nowhere = Connection(connect=None)

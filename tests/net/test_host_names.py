@@ -1,4 +1,4 @@
-"""Host names that do not resolve: every command says so at once, with the name."""
+"""Host names that do not resolve: every command reports the name at once."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ UNKNOWN = "tcp/nohost.invalid:7447"
         f"tcp/{'x' * 64}:1",
     ],
 )
-def test_a_name_that_does_not_resolve_is_refused_by_name(place: str) -> None:
+def test_unresolvable_names_are_refused(place: str) -> None:
     with pytest.raises(UnknownHost) as refused:
         check_hosts(["tcp/127.0.0.1:1", place])
     assert str(refused.value).startswith(f"{place}: the host name '")
@@ -49,12 +49,15 @@ def test_a_name_that_does_not_resolve_is_refused_by_name(place: str) -> None:
         "tcp/:7447",
     ],
 )
-def test_what_is_no_unknown_name_passes(place: str) -> None:
+def test_other_names_pass(place: str) -> None:
     check_hosts([place])
 
 
-def test_members_with_an_unknown_name_never_begin_to_wait() -> None:
-    """Peers tried for ever, and clients said that no router answers yet. A group of locators counts too."""
+def test_members_with_unknown_names_never_wait() -> None:
+    """Otherwise peers retry for ever, and clients report that no router answers yet.
+
+    A group of locators counts too.
+    """
     said: list[str] = []
     for connection in (
         Connection(connect=[f"tcp/{NO_NAME}:1"]),
@@ -91,12 +94,12 @@ COMMANDS = [
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda text: text.partition(f" {UNKNOWN}")[0])
-def test_every_command_names_the_host_that_does_not_resolve(
-    command: str, tmp_path: Path
-) -> None:
-    words = [sys.executable, "-m", "trilat_net", *command.split()]
-    made = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert made.returncode in (1, 2)  # 1: the examination of `doctor` found a failure
-    assert "nohost.invalid" in made.stdout + made.stderr
-    assert "resol" in made.stdout + made.stderr
-    assert "Traceback" not in made.stderr
+def test_every_command_names_its_unresolvable_host(command: str, tmp_path: Path) -> None:
+    command_line = [sys.executable, "-m", "trilat_net", *command.split()]
+    process = subprocess.run(
+        command_line, cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert process.returncode in (1, 2)  # 1: the examination of `doctor` found a failure
+    assert "nohost.invalid" in process.stdout + process.stderr
+    assert "resol" in process.stdout + process.stderr
+    assert "Traceback" not in process.stderr

@@ -1,4 +1,4 @@
-"""The files of the sites that run on this machine: hints, for whoever must stop them at once."""
+"""The files of the sites that run on this machine: hints for stopping the sites at once."""
 
 import os
 import stat
@@ -31,17 +31,22 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "trilat-net" / "running"
 
 
-def test_a_running_site_is_known_to_its_user_alone(state: Path) -> None:
+def test_running_sites_are_known_to_their_user(state: Path) -> None:
     assert find_known_sites("t") == []
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
-        (one,) = find_known_sites("t")
-        assert (one.site, tuple(one.sites), one.stop, one.keyed) == (
+        (known_site,) = find_known_sites("t")
+        assert (
+            known_site.site,
+            tuple(known_site.sites),
+            known_site.stop,
+            known_site.keyed,
+        ) == (
             "s",
             SITES,
             b"order",
             False,
         )
-        assert one.places == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
+        assert known_site.places == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
         assert find_known_sites("another") == []
         (file,) = state.iterdir()
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -49,15 +54,15 @@ def test_a_running_site_is_known_to_its_user_alone(state: Path) -> None:
     assert list(state.iterdir()) == []
 
 
-def test_one_whose_process_or_machine_is_gone_counts_for_nothing(state: Path) -> None:
+def test_dead_processes_and_machines_count_nothing(state: Path) -> None:
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
-        (one,) = find_known_sites("t")
+        (known_site,) = find_known_sites("t")
     gone = subprocess.Popen([sys.executable, "-S", "-c", ""])
     gone.wait()
     for n, stale in enumerate(
         (
-            msgspec.structs.replace(one, pid=gone.pid),
-            msgspec.structs.replace(one, machine=f"not {SystemClock().identity()}"),
+            msgspec.structs.replace(known_site, pid=gone.pid),
+            msgspec.structs.replace(known_site, machine=f"not {SystemClock().identity()}"),
         )
     ):
         (state / f"{n}.json").write_bytes(msgspec.json.encode(stale))
@@ -66,20 +71,20 @@ def test_one_whose_process_or_machine_is_gone_counts_for_nothing(state: Path) ->
 
 
 @given(st.binary())
-def test_what_is_no_file_of_a_site_is_passed_over(data: bytes) -> None:
+def test_invalid_site_files_are_ignored(data: bytes) -> None:
     folder = Path(os.environ["XDG_STATE_HOME"]) / "trilat-net" / "running"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "x.json").write_bytes(data)
     assert find_known_sites("t") == []
 
 
-def test_a_site_runs_where_no_file_can_be_written(state: Path) -> None:
+def test_sites_run_without_writable_files(state: Path) -> None:
     state.parent.write_text("no folder")
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
         assert find_known_sites("t") == []
 
 
-def test_endpoints_are_known_as_the_member_reaches_them() -> None:
+def test_endpoints_are_known_as_reachable() -> None:
     with make_site_known("t", "m", SITES, 6, HERE, b"order"):
         assert find_known_endpoints("t", Connection(connect=None)) is None
         with make_site_known("t", "s", SITES, 7, Connection(("tcp/127.0.0.1:2",)), b"order"):
@@ -93,34 +98,34 @@ def test_endpoints_are_known_as_the_member_reaches_them() -> None:
             assert find_known_endpoints("t", Connection(connect=None, mode="client")) is None
 
 
-def test_site_with_settings_of_its_user_is_for_nobody_else() -> None:
+def test_sites_with_own_settings_are_private() -> None:
     with make_site_known("t", "s", SITES, 7, replace(HERE, settings={"x": 1}), b"order"):
         assert find_known_sites("t") == []
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]]
+    "arguments", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]]
 )
-def test_what_is_no_stop_of_arms_goes_long_way_silently(
-    words: list[str], capsys: pytest.CaptureFixture[str]
+def test_other_commands_take_the_normal_way_quietly(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert stop_at_once(words) == words
+    assert stop_at_once(arguments) == arguments
     assert capsys.readouterr().out == ""
 
 
 @given(st.lists(st.text()))
-def test_any_words_go_the_long_way_as_they_are(words: list[str]) -> None:
+def test_arbitrary_words_take_the_normal_way(words: list[str]) -> None:
     assert stop_at_once(words) == words
 
 
-def test_it_says_at_once_that_it_tries(capsys: pytest.CaptureFixture[str]) -> None:
+def test_stops_report_their_attempt_at_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert stop_at_once(["--session=t", "m", "s"]) == ["--session=t", "m", "s"]
     assert capsys.readouterr().out == "stopping m, s of session t ...\n"
     assert stop_at_once(["--session", "t", "--connect", "tcp/127.0.0.1:1"])
     assert capsys.readouterr().out == "stopping every arm of session t ...\n"
 
 
-def test_keys_that_are_missing_are_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_keys_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     with make_site_known(
         "t", "s", SITES, 7, replace(HERE, keys_of="operator", settings={"x": 1}), b"order"
     ):
@@ -128,7 +133,7 @@ def test_keys_that_are_missing_are_said(capsys: pytest.CaptureFixture[str]) -> N
     assert "have keys: add --keys DIR" in capsys.readouterr().err
 
 
-def test_a_stop_imports_nothing_that_it_does_not_need() -> None:
+def test_stops_import_only_their_needs() -> None:
     code = (
         "import sys; from trilat_net.net.known_sites import stop_at_once; stop_at_once(['--session', 't']); "
         "print(*{'numba', 'numpy', 'scipy', 'typer', 'rich', 'cryptography', 'mcap'} & {*sys.modules})"

@@ -1,7 +1,8 @@
-"""Keys of members, and what a member with a valid certificate cannot do all the same.
+"""Keys of members, and the limits of a member with a valid certificate.
 
-The attacker is a member, `s`, that holds itself to no rules; what it may say comes after what it may not on
-the same link, so that the first has been refused once the second is there.
+The attacker is a member, `s`, that enforces no rules. Its permitted messages follow its
+forbidden ones on the same link, so that a forbidden one has been refused once a permitted one
+arrives.
 """
 
 import json
@@ -46,7 +47,7 @@ from trilat_net.net.zenoh_config import (
 )
 from trilat_net.scenario import load_scenario
 
-from .waiting import answered, drained, received, until
+from .waiting import drained, query_once, received, until
 
 SITES = ("m1", "m2", "s")
 ALL = (*SITES, RECORDER, OPERATOR, ROUTER, BRIDGE)
@@ -54,46 +55,50 @@ ALL = (*SITES, RECORDER, OPERATOR, ROUTER, BRIDGE)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("deployment") / "keys"
-    create_keys(made, ALL, ["192.0.2.1", "robot.example"], 30)
-    return made
+    keys_folder = tmp_path_factory.mktemp("deployment") / "keys"
+    create_keys(keys_folder, ALL, ["192.0.2.1", "robot.example"], 30)
+    return keys_folder
 
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("others") / "keys"
-    create_keys(made, ALL, [], 30)
-    return made
+    keys_folder = tmp_path_factory.mktemp("others") / "keys"
+    create_keys(keys_folder, ALL, [], 30)
+    return keys_folder
 
 
 def lawless(keys: MemberKeys) -> dict[str, Any]:
-    """The settings of a member that holds nobody to any rules, itself neither."""
+    """Returns the settings of a member that enforces no rules, not even on itself."""
     return {"transport": keys.settings["transport"]}
 
 
 class Meeting:
-    """m1 and m2 with their keys, and whoever joins them, as peers of one another or through a router."""
+    """m1 and m2 with their keys, and a third member, as peers of one another or through a router."""
 
     def __init__(self, folder: Path, *, routed: bool) -> None:
         self.folder, self.members = folder, list[Bus]()
-        places = [place.replace("tcp", "tls") for place in find_free_endpoints(3)]
+        places = [
+            free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(3)
+        ]
         self._places, self._mode = (places[2:], "client") if routed else (places[:2], "peer")
         if routed:
             self.members.append(ZenohBus(places[2:], mode="router", settings=self._own(ROUTER)))
-        listens = [[], []] if routed else [[place] for place in places[:2]]
+        listens = [[], []] if routed else [[endpoint] for endpoint in places[:2]]
         self.m1 = self._enter(listens[0], places[2:] if routed else [], self._own("m1"))
         self.m2 = self._enter(listens[1], places[2:] if routed else places[:1], self._own("m2"))
 
     def _own(self, member: str) -> dict[str, Any]:
         return read_member_keys(self.folder / member).settings
 
-    def _enter(self, listen: list[str], connect: list[str], own: dict[str, Any]) -> ZenohBus:
-        bus = ZenohBus(listen, connect, self._mode, own)  # type: ignore[arg-type]
+    def _enter(
+        self, listen: list[str], connect: list[str], settings: dict[str, Any]
+    ) -> ZenohBus:
+        bus = ZenohBus(listen, connect, self._mode, settings)  # type: ignore[arg-type]
         self.members.append(bus)
         return bus
 
-    def join(self, own: dict[str, Any]) -> ZenohBus:
-        return self._enter([], self._places, own)
+    def join(self, settings: dict[str, Any]) -> ZenohBus:
+        return self._enter([], self._places, settings)
 
     def close(self) -> None:
         for member in reversed(self.members):
@@ -104,28 +109,28 @@ class Meeting:
     params=[False, pytest.param(True, marks=pytest.mark.long)], ids=["peers", "router"]
 )
 def meeting(request: pytest.FixtureRequest, folder: Path) -> Iterator[Meeting]:
-    made = Meeting(folder, routed=request.param)
-    yield made
-    made.close()
+    key_meeting = Meeting(folder, routed=request.param)
+    yield key_meeting
+    key_meeting.close()
 
 
 def key(member: str, channel: str) -> str:
     return topics.key("x", member, channel)
 
 
-def heard(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
-    came: list[tuple[str, bytes]] = []
+def exchange_messages(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
+    messages: list[tuple[str, bytes]] = []
 
     def there() -> bool:
         say(b"true")
-        came.extend(drained(inbox))
-        return any(payload == b"true" for _, payload in came)
+        messages.extend(drained(inbox))
+        return any(payload == b"true" for _, payload in messages)
 
     until(there)
-    return came
+    return messages
 
 
-def test_a_member_speaks_under_its_own_name_alone(meeting: Meeting, folder: Path) -> None:
+def test_members_speak_under_their_own_name_only(meeting: Meeting, folder: Path) -> None:
     attacker = meeting.join(lawless(read_member_keys(folder / "s")))
     inbox, alive = (
         meeting.m1.inbox(key("*", topics.EVENT)),
@@ -142,16 +147,16 @@ def test_a_member_speaks_under_its_own_name_alone(meeting: Meeting, folder: Path
         forged(b"forged")
         true(payload)
 
-    assert {where for where, _ in heard(say, inbox)} == {key("s", topics.EVENT)}
+    assert {where for where, _ in exchange_messages(say, inbox)} == {key("s", topics.EVENT)}
     assert until(alive.poll) == (topics.presence_key("x", "s").replace("*", "7"), True)
     assert drained(alive) == []
 
 
-def test_nobody_answers_for_another(meeting: Meeting, folder: Path) -> None:
+def test_no_member_answers_for_another(meeting: Meeting, folder: Path) -> None:
     attacker = meeting.join(lawless(read_member_keys(folder / "s")))
     attacker.respond(key("m2", topics.INFO), lambda _: b"forged")
     attacker.respond(key("s", topics.INFO), lambda _: b"true")
-    first = until(lambda: answered(meeting.m1, key("*", topics.INFO)))
+    first = until(lambda: query_once(meeting.m1, key("*", topics.INFO)))
     assert first == (key("s", topics.INFO), b"true")
     answers = [reply[1] for reply in received(meeting.m1.query(key("*", topics.INFO)), 1)]
     assert answers == [b"true"]
@@ -163,8 +168,8 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
     meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
     channels = (topics.HAND, topics.ENABLE)
     inboxes = [meeting.m1.inbox(key("m1", channel)) for channel in channels]
-    assert until(lambda: answered(operator, key("m1", topics.SET), b"order"))
-    assert answered(attacker, key("m1", topics.SET), b"order") is None
+    assert until(lambda: query_once(operator, key("m1", topics.SET), b"order"))
+    assert query_once(attacker, key("m1", topics.SET), b"order") is None
 
     for channel, inbox in zip(channels, inboxes, strict=True):
         forged, true = (bus.publisher(key("m1", channel)) for bus in (attacker, operator))
@@ -173,20 +178,21 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
             forged(b"forged")
             true(payload)
 
-        assert {payload for _, payload in heard(say, inbox)} == {b"true"}
+        assert {payload for _, payload in exchange_messages(say, inbox)} == {b"true"}
 
 
-def test_a_bridge_is_hand_and_arm_and_holds_no_switch(meeting: Meeting, folder: Path) -> None:
-    """It gives orders as well; it speaks in the name of no site, and hears no more than it shows."""
+def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path) -> None:
+    """A bridge gives orders as well; it speaks in the name of no site, and hears no more than it shows."""
     bridge, operator = (
         meeting.join(read_member_keys(folder / name).settings) for name in (BRIDGE, OPERATOR)
     )
     meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
-    assert until(lambda: answered(bridge, key("m1", topics.SET), b"reset"))
+    assert until(lambda: query_once(bridge, key("m1", topics.SET), b"reset"))
     for channel in (topics.HAND, topics.MEASURED):
         inbox = meeting.m1.inbox(key("m1", channel))
         assert {
-            payload for _, payload in heard(bridge.publisher(key("m1", channel)), inbox)
+            payload
+            for _, payload in exchange_messages(bridge.publisher(key("m1", channel)), inbox)
         } == {b"true"}
     switch = meeting.m1.inbox(key("m1", topics.ENABLE))
     forged, true = (bus.publisher(key("m1", topics.ENABLE)) for bus in (bridge, operator))
@@ -195,7 +201,7 @@ def test_a_bridge_is_hand_and_arm_and_holds_no_switch(meeting: Meeting, folder: 
         forged(b"forged")
         true(payload)
 
-    assert {payload for _, payload in heard(say, switch)} == {b"true"}
+    assert {payload for _, payload in exchange_messages(say, switch)} == {b"true"}
     states, samples = (
         bridge.inbox(key("*", channel)) for channel in (topics.STATE, topics.SAMPLE)
     )
@@ -206,13 +212,11 @@ def test_a_bridge_is_hand_and_arm_and_holds_no_switch(meeting: Meeting, folder: 
         state(payload)
 
     state = meeting.m1.publisher(key("m1", topics.STATE))
-    assert heard(tell, states)
+    assert exchange_messages(tell, states)
     assert drained(samples) == []
 
 
-def test_every_member_may_ask_site_to_stop_and_nothing_else(
-    meeting: Meeting, folder: Path
-) -> None:
+def test_every_member_may_stop_but_no_more(meeting: Meeting, folder: Path) -> None:
     for channel in (topics.STOP, topics.SET):
         meeting.m1.respond(key("m1", channel), lambda payload: payload)
     members = [
@@ -220,27 +224,29 @@ def test_every_member_may_ask_site_to_stop_and_nothing_else(
         for name in ("s", RECORDER, OPERATOR)
     ]
     for member in members:
-        assert until(lambda bus=member: answered(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
-    assert until(lambda: answered(members[2], key("m1", topics.SET), b"reset"))
-    assert [answered(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [
+        assert until(lambda bus=member: query_once(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
+    assert until(lambda: query_once(members[2], key("m1", topics.SET), b"reset"))
+    assert [query_once(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [
         None,
         None,
     ]
 
 
-def test_a_member_whose_name_was_taken_out_is_denied_everything(
-    folder: Path, tmp_path: Path
-) -> None:
-    """By the list in the folder of the one that it speaks to; its certificate is still good."""
+def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> None:
+    """By the list in the folder of the member that the removed one speaks to; its certificate
+    is still valid.
+    """
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o600)
     listed = [name for name in ALL if name != "s"]
     (tmp_path / MEMBERS).write_text(json.dumps({"member": "m1", "members": listed}))
-    (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
-    m1 = ZenohBus([place], settings=read_member_keys(tmp_path).settings)
+    (endpoint,) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
+    )
+    m1 = ZenohBus([endpoint], settings=read_member_keys(tmp_path).settings)
     others = {
-        name: ZenohBus([], [place], settings=read_member_keys(folder / name).settings)
+        name: ZenohBus([], [endpoint], settings=read_member_keys(folder / name).settings)
         for name in ("s", "m2")
     }
     try:
@@ -253,13 +259,15 @@ def test_a_member_whose_name_was_taken_out_is_denied_everything(
             withdrawn(b"withdrawn")
             true(payload)
 
-        assert {where for where, _ in heard(say, inbox)} == {key("m2", topics.EVENT)}
+        assert {where for where, _ in exchange_messages(say, inbox)} == {
+            key("m2", topics.EVENT)
+        }
     finally:
         for bus in (*others.values(), m1):
             bus.close()
 
 
-def test_an_oversized_message_is_dropped_and_others_go_on(meeting: Meeting) -> None:
+def test_oversized_messages_are_dropped_alone(meeting: Meeting) -> None:
     inbox, publish = (
         meeting.m1.inbox(key("m2", topics.STATE)),
         meeting.m2.publisher(key("m2", topics.STATE)),
@@ -271,7 +279,7 @@ def test_an_oversized_message_is_dropped_and_others_go_on(meeting: Meeting) -> N
         publish(bytes(MOST_PUT_BYTES + 1))
         publish(payload)
 
-    assert {payload for _, payload in heard(say, records)} == {b"true"}
+    assert {payload for _, payload in exchange_messages(say, records)} == {b"true"}
     assert drained(inbox) == []  # a site hears no records but its own
 
 
@@ -287,14 +295,14 @@ def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
             meeting.join(lawless(read_member_keys(foreign / "m2")))
     else:
         stranger.publisher(key("m2", topics.EVENT))(b"forged")
-    came = heard(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
-    assert {payload for _, payload in came} == {b"true"}
+    messages = exchange_messages(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
+    assert {payload for _, payload in messages} == {b"true"}
 
 
-def test_a_flipped_bit_ends_the_connection_which_is_made_again(folder: Path) -> None:
-    """TLS finds it: no payload comes otherwise than it was sent, not even if Zenoh dies of it."""
-    words = [sys.executable, "-m", "tests.net.flipped_bit", str(folder)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+def test_flipped_bits_end_connections_which_return(folder: Path) -> None:
+    """TLS finds the bit: no payload arrives changed, even if Zenoh dies of the error."""
+    command = [sys.executable, "-m", "tests.net.flipped_bit", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert set(done.stdout.split()) <= {"true", "again"}
     if done.returncode in (-signal.SIGABRT, -signal.SIGSEGV):
         pytest.xfail(
@@ -306,7 +314,7 @@ def test_a_flipped_bit_ends_the_connection_which_is_made_again(folder: Path) -> 
     assert "true" in after
 
 
-def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
+def test_incomplete_keys_are_refused(folder: Path, tmp_path: Path) -> None:
     keys = read_member_keys(folder / "m1")
     assert (keys.member, keys.members) == ("m1", ALL)
     with pytest.raises(UsageError, match="folder of one member"):
@@ -323,26 +331,26 @@ def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("take", "from_", "words"),
+    ("take", "from_", "phrase"),
     [
         (CERTIFICATE, "s", "is for s, but"),
         (PRIVATE_KEY, "m2", "the private key and the certificate do not match"),
         ("authority.pem", "", "has not signed"),
     ],
 )
-def test_keys_of_several_do_not_mix(
-    take: str, from_: str, words: str, folder: Path, foreign: Path, tmp_path: Path
+def test_keys_of_several_sets_do_not_mix(
+    take: str, from_: str, phrase: str, folder: Path, foreign: Path, tmp_path: Path
 ) -> None:
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o600)
     source = folder / from_ if from_ else foreign / "m1"
     (tmp_path / take).write_bytes((source / take).read_bytes())
-    with pytest.raises(UsageError, match=words):
+    with pytest.raises(UsageError, match=phrase):
         read_member_keys(tmp_path)
 
 
-def test_a_key_that_others_can_read_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_keys_readable_by_others_are_refused(folder: Path, tmp_path: Path) -> None:
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o644)
@@ -363,7 +371,7 @@ def test_a_key_that_others_can_read_is_refused(folder: Path, tmp_path: Path) -> 
         ("unixsock-stream//tmp/x", False),
     ],
 )
-def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> None:
+def test_without_keys_nobody_listens_on_a_network(listen: str, open_: bool) -> None:
     connection = Connection([listen])
     assert secure_connection(connection, None, insecure=True) == connection
     if open_:
@@ -373,13 +381,13 @@ def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> N
         assert secure_connection(connection, None, insecure=False) == connection
 
 
-def test_ones_own_mutual_tls_is_as_good_as_keys() -> None:
-    own = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
-    safe = Connection(["tls/192.0.2.1:7447"], settings=own)
+def test_own_mutual_tls_equals_keys() -> None:
+    settings = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
+    safe = Connection(["tls/192.0.2.1:7447"], settings=settings)
     assert secure_connection(safe, None, insecure=False) == safe
     with pytest.raises(UsageError, match="insecure=True"):
         secure_connection(
-            Connection(["tcp/192.0.2.1:7447"], settings=own), None, insecure=False
+            Connection(["tcp/192.0.2.1:7447"], settings=settings), None, insecure=False
         )
 
 
@@ -406,7 +414,7 @@ def test_with_keys_links_are_encrypted(folder: Path) -> None:
         )
 
 
-def test_every_rule_names_its_member_or_everybody_and_denies_rest() -> None:
+def test_every_rule_names_members_and_denies_others() -> None:
     rules = make_access_rules(ALL)["access_control"]
     assert rules["enabled"] is True
     assert rules["default_permission"] == "deny"
@@ -416,7 +424,9 @@ def test_every_rule_names_its_member_or_everybody_and_denies_rest() -> None:
         if rule["flows"] == ["ingress"] and rule["messages"] == ["put"]
     }
     for site in SITES:
-        assert {topics.parse_key(one).member for one in says[site]} == {site}  # type: ignore[union-attr]
+        assert {topics.parse_key(key_expression).member for key_expression in says[site]} == {
+            site
+        }  # type: ignore[union-attr]
     assert says[OPERATOR] == {
         topics.key("*", "*", channel) for channel in ROLES[OPERATOR].publishes_to
     }
@@ -447,7 +457,7 @@ def test_names_that_look_alike_are_refused(name: str, tmp_path: Path) -> None:
 
 def test_names_of_ascii_letters_are_taken(tmp_path: Path) -> None:
     names = ["m1", "Robot-2", "arm_3", "9"]
-    assert [made.name for made in create_keys(tmp_path / "keys", names)] == names
+    assert [created.name for created in create_keys(tmp_path / "keys", names)] == names
     for name in (*names, "paper.2"):
         assert check_session_name(name) == name
 
@@ -456,7 +466,7 @@ def test_names_of_ascii_letters_are_taken(tmp_path: Path) -> None:
 def make_ending_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[timedelta], Path]:
-    """Makes keys that have ended, whose certificates hold for a while yet."""
+    """Makes keys that have ended, whose certificates are valid for a while yet."""
 
     def make(holds: timedelta) -> Path:
         monkeypatch.setattr(member_keys, "STOPPING_TIME", holds)
@@ -468,21 +478,21 @@ def make_ending_keys(
 
 @contextmanager
 def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus, ZenohBus]]:
-    """The site m1, which listens, and s, which is connected to it."""
-    (place,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
-    own = {
+    """Connects the sites m1, which listens, and s."""
+    (first_endpoint,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
+    settings = {
         member: read_member_keys(folder / member, stops=stops).settings
         for member in ("m1", "s")
     }
     with (
-        closing(ZenohBus([place], settings=own["m1"])) as site,
-        closing(ZenohBus([], [place], settings=own["s"])) as peer,
+        closing(ZenohBus([first_endpoint], settings=settings["m1"])) as site,
+        closing(ZenohBus([], [first_endpoint], settings=settings["s"])) as peer,
     ):
         yield site, peer
 
 
 @pytest.mark.long
-def test_open_link_outlives_its_certificate(
+def test_open_links_outlive_certificates(
     make_ending_keys: Callable[[timedelta], Path],
 ) -> None:
     """Zenoh closes no link at the end of a certificate, so that no date ends a session."""
@@ -493,12 +503,12 @@ def test_open_link_outlives_its_certificate(
             peer.inbox(key("m1", topics.EVENT)),
             site.publisher(key("m1", topics.EVENT)),
         )
-        assert heard(say, inbox)
+        assert exchange_messages(say, inbox)
         until(lambda: datetime.now(UTC) > ends + timedelta(seconds=1), 30.0)
-        assert heard(say, inbox)
+        assert exchange_messages(say, inbox)
 
 
-def test_ended_keys_stop_arms_and_nothing_else(
+def test_ended_keys_may_only_stop_arms(
     make_ending_keys: Callable[[timedelta], Path],
 ) -> None:
     folder = make_ending_keys(timedelta(days=1))
@@ -516,7 +526,7 @@ def test_ended_keys_stop_arms_and_nothing_else(
         until(is_asked)
 
 
-def test_renewed_keys_meet_those_that_are_not_renewed(tmp_path: Path) -> None:
+def test_renewed_keys_meet_older_ones(tmp_path: Path) -> None:
     """Members are renewed one after the other; hosts, names and private keys stay."""
     folder = tmp_path / "keys"
     create_keys(folder, ALL, ["192.0.2.1"], 5)
@@ -525,11 +535,11 @@ def test_renewed_keys_meet_those_that_are_not_renewed(tmp_path: Path) -> None:
     assert renew_keys(folder, ["m1"], 90) == [folder / "m1"]
     assert read_member_keys(folder / "m1").ends > datetime.now(UTC) + timedelta(days=89)
     assert read_member_keys(folder / "s").ends < datetime.now(UTC) + timedelta(days=6)
-    assert [one.value for one in load_certificate(folder / "m1").extensions] == [
-        one.value for one in names
+    assert [extension.value for extension in load_certificate(folder / "m1").extensions] == [
+        name.value for name in names
     ]
     with two_members(folder) as (site, peer):
-        assert heard(
+        assert exchange_messages(
             site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
         )
     assert {path.name for path in renew_keys(folder)} == set(ALL)
@@ -545,7 +555,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_an_added_member_meets_the_others_whose_keys_stay(tmp_path: Path) -> None:
+def test_added_members_meet_the_others(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     create_keys(folder, ["m1", "m2"], ["192.0.2.1"], 5)
     before = read_files(folder)
@@ -565,14 +575,16 @@ def test_an_added_member_meets_the_others_whose_keys_stay(tmp_path: Path) -> Non
     for member in ("m1", "m2", "s"):
         assert read_member_keys(folder / member).members == ("m1", "m2", "s")
     with two_members(folder) as (site, peer):  # m1, whose keys are the old ones, and s
-        assert heard(peer.publisher(key("s", topics.EVENT)), site.inbox(key("s", topics.EVENT)))
-        assert heard(
+        assert exchange_messages(
+            peer.publisher(key("s", topics.EVENT)), site.inbox(key("s", topics.EVENT))
+        )
+        assert exchange_messages(
             site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
         )
     assert {path.name for path in renew_keys(folder)} == {"m1", "m2", "s"}
 
 
-def test_members_that_cannot_be_added_change_nothing(
+def test_impossible_members_change_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "keys"
@@ -611,7 +623,7 @@ def test_members_that_cannot_be_added_change_nothing(
         add_keys(folder, ["s2"])
 
 
-def test_keys_that_cannot_be_renewed_are_refused(tmp_path: Path) -> None:
+def test_unrenewable_keys_are_refused(tmp_path: Path) -> None:
     for name in ("keys", "others"):
         create_keys(tmp_path / name, SITES)
     with pytest.raises(
@@ -637,8 +649,8 @@ def load_certificate(folder: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
 
 
-def test_keys_that_end_before_session_are_refused(tmp_path: Path) -> None:
-    """The end is known when a site begins, and again when the session begins for which it has waited."""
+def test_keys_ending_before_sessions_are_refused(tmp_path: Path) -> None:
+    """The end is checked when a site begins, and again when the awaited session begins."""
     create_keys(tmp_path / "keys", ["m", "s"], days=1)
     for member, words in (("m", "two_sites"), ("s", "two_sites")):
         long = ("--set", "duration_s=86400")

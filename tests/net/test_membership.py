@@ -1,4 +1,4 @@
-"""A recorder comes into a session that runs; nobody else does."""
+"""Only a recorder may join a running session."""
 
 from contextlib import suppress
 
@@ -19,7 +19,7 @@ RECORDER = topics.RECORDER
 
 
 def running(*others: str) -> tuple[Party, Epoch]:
-    """A session of all sites, and of others, that runs, and its epoch."""
+    """Returns a running session of all sites and of others, and its epoch."""
     session = Party(SITES)
     session.start(*SITES, *others)
     epoch = session.agreed()
@@ -35,7 +35,7 @@ def joined(session: Party, within_ns: int) -> Epoch | None:
     return session.members[RECORDER].epoch
 
 
-def test_it_learns_epoch_and_boots_from_those_who_run() -> None:
+def test_recorders_learn_epoch_and_boots() -> None:
     session, epoch = running()
     session.start(RECORDER)
     late = joined(session, LATE_GATHER_NS)
@@ -45,7 +45,7 @@ def test_it_learns_epoch_and_boots_from_those_who_run() -> None:
 
 @given(ahead_ns=st.integers(-(10**9) + 1, 10**15), unix_ns=st.integers(0, 2**60))
 @settings(max_examples=30, deadline=None)
-def test_on_clock_of_its_own_it_finds_same_instant(ahead_ns: int, unix_ns: int) -> None:
+def test_skewed_recorders_find_the_same_instant(ahead_ns: int, unix_ns: int) -> None:
     session, epoch = running()
     session.start(RECORDER, on_clock=session.elsewhere(ahead_ns, unix_ns))
     late = joined(session, 4 * LATE_GATHER_NS)
@@ -54,7 +54,7 @@ def test_on_clock_of_its_own_it_finds_same_instant(ahead_ns: int, unix_ns: int) 
     assert late.unix_ns == epoch.unix_ns
 
 
-def test_site_that_is_gone_is_waited_for_while_only() -> None:
+def test_missing_sites_are_awaited_briefly() -> None:
     session, epoch = running()
     session.kill("s")
     session.start(RECORDER)
@@ -63,7 +63,7 @@ def test_site_that_is_gone_is_waited_for_while_only() -> None:
     assert set(session.members[RECORDER].joining.membership.others) == {"m1", "m2"}
 
 
-def test_of_two_recorders_at_the_start_one_is_late() -> None:
+def test_one_of_two_recorders_is_late() -> None:
     session = Party(SITES)
     session.start(*SITES, RECORDER)
     first = session.members["first"] = session.members.pop(RECORDER)
@@ -81,7 +81,7 @@ def test_of_two_recorders_at_the_start_one_is_late() -> None:
     assert [member.epoch.mono_ns for member in both if member.epoch] == [epoch.mono_ns] * 2
 
 
-def test_a_recorder_that_missed_the_start_joins_after_it() -> None:
+def test_recorders_may_join_after_the_start() -> None:
     session = Party(SITES)
     session.start(*SITES, RECORDER)
     while session.kinds().count("ready") < len(SITES):
@@ -102,7 +102,7 @@ def test_a_recorder_that_missed_the_start_joins_after_it() -> None:
 @pytest.mark.parametrize(
     "forged", [{"boots": {"m1": 5}}, {"boots": {}}, {"scenario": ""}, {"running": False}]
 )
-def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> None:
+def test_contradicting_members_are_not_believed(forged: dict[str, object]) -> None:
     session, _ = running()
     for name in SITES:
         publisher = session.members[name].publisher
@@ -114,7 +114,7 @@ def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> N
     assert session.members[RECORDER].epoch is None
 
 
-def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
+def test_recorders_do_not_learn_from_recorders() -> None:
     session, epoch = running(RECORDER)
     session.members["other"] = session.members.pop(RECORDER)
     session.start(RECORDER)
@@ -122,7 +122,7 @@ def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
     assert RECORDER not in session.members[RECORDER].joining.membership.others
 
 
-def test_a_site_still_does_not_come_late() -> None:
+def test_sites_still_cannot_come_late() -> None:
     session, _ = running()
     session.kill("s")
     session.start("s")
@@ -130,8 +130,10 @@ def test_a_site_still_does_not_come_late() -> None:
         session.rounds(30)
 
 
-def test_a_site_that_begins_anew_too_is_not_waited_for() -> None:
-    """Who is met under another boot, while the old one's token is not there, has gone before anybody came."""
+def test_restarted_sites_are_not_awaited() -> None:
+    """A member met under another boot, while the old boot's token is absent, left before the
+    newcomer arrived.
+    """
     session, epoch = running()
     session.kill("s")
     session.start(RECORDER)

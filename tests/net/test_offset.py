@@ -32,15 +32,15 @@ messages = st.lists(
 
 @given(others, messages, st.integers(0, 100 * S))
 @settings(max_examples=100)
-def test_true_offset_and_drift_are_inside_whatever_delays_were(
+def test_true_offset_and_drift_stay_inside_bounds(
     other: Other, crossings: list[tuple[int, bool, int]], silence_ns: int
 ) -> None:
-    """Delays as unequal as one likes, pauses, ways that say nothing, and a silence afterwards."""
+    """Delays as unequal as possible, pauses, ways without messages, and a silence afterwards."""
     estimator = OffsetEstimator()
     now_ns = latest_ns = 0
-    for pause_ns, there, delay_ns in crossings:
+    for pause_ns, there_ns, delay_ns in crossings:
         now_ns += pause_ns
-        if there:
+        if there_ns:
             estimator.add(ceiling(other, now_ns, delay_ns), None)
         else:
             estimator.add(None, floor(other, now_ns, delay_ns))
@@ -48,7 +48,7 @@ def test_true_offset_and_drift_are_inside_whatever_delays_were(
     estimate = estimator.estimate(latest_ns)
     assert estimator.broken == 0
     if estimate is None:
-        assert len({there for _, there, _ in crossings}) == 1
+        assert len({there_ns for _, there_ns, _ in crossings}) == 1
         return
     for later_ns in (0, silence_ns):
         at_ns = latest_ns + later_ns
@@ -60,18 +60,20 @@ def test_true_offset_and_drift_are_inside_whatever_delays_were(
 
 
 @given(others, delays, delays)
-def test_one_exchange_gives_classical_offset_and_half_its_round_trip(
+def test_one_exchange_gives_the_classical_offset(
     other: Other, there_ns: int, back_ns: int
 ) -> None:
-    """Four stamps of one instant: (t1 + t2 - t3 - t4)/2 within (t4 - t1 - (t3 - t2))/2, and drift besides."""
+    """Four stamps of one instant: (t1 + t2 - t3 - t4)/2 within (t4 - t1 - (t3 - t2))/2, and
+    drift besides.
+    """
     sent = ceiling(other, 0, there_ns)
-    came = floor(other, there_ns, back_ns)
+    bound = floor(other, there_ns, back_ns)
     estimator = OffsetEstimator()
-    estimator.add(sent, came)
+    estimator.add(sent, bound)
     estimate = estimator.estimate(there_ns + back_ns)
     assert estimate is not None
     trip_ns = there_ns + back_ns
-    classical = (sent.offset_ns + came.offset_ns) / 2
+    classical = (sent.offset_ns + bound.offset_ns) / 2
     spread_ns = 600e-6 * trip_ns + 2
     assert abs(estimate.offset_ns - classical) <= spread_ns
     bound_ns = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)
@@ -85,7 +87,7 @@ def test_one_exchange_gives_classical_offset_and_half_its_round_trip(
     ("offset_ns", "drift_ppb"), [(3 * S, 100_000), (-2 * DAY, -100_000), (5, 0)]
 )
 def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: int) -> None:
-    """Within 100 us and 20 ppm after 10 s, 5 ppm after 60 s, of ways as they are on one busy machine."""
+    """Within 100 us and 20 ppm after 10 s, 5 ppm after 60 s, for the ways of one busy machine."""
     other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
     for n in range(60):
         estimator.add(*second(other, n * S, queueing(90, 200), queueing(120, 300), rnd))
@@ -100,7 +102,7 @@ def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: in
     assert estimate.drift_high - estimate.drift_low <= 20_000
 
 
-def test_ways_that_are_unlike_bias_estimate_and_bound_says_so() -> None:
+def test_unequal_ways_bias_estimates_within_bounds() -> None:
     other, rnd, estimator = Other(S, 20_000), random.Random(1), OffsetEstimator()
     for n in range(20):
         estimator.add(*second(other, n * S, queueing(500, 50), queueing(100, 50), rnd))
@@ -111,7 +113,7 @@ def test_ways_that_are_unlike_bias_estimate_and_bound_says_so() -> None:
     assert abs(error_ns) <= estimate.error_bound_ns(20 * S, estimate.offset_ns) <= 350_000
 
 
-def test_the_bound_is_of_the_quickest_messages_each_way() -> None:
+def test_bounds_follow_the_quickest_messages() -> None:
     other, estimator = Other(7, 0), OffsetEstimator()
     estimator.add(ceiling(other, 0, 10_000), floor(other, 1_000_000, 900_000))
     estimator.add(ceiling(other, 2_000_000, 900_000), floor(other, 3_000_000, 20_000))
@@ -120,12 +122,12 @@ def test_the_bound_is_of_the_quickest_messages_each_way() -> None:
     assert estimate.error_bound_ns(4_000_000, estimate.offset_ns) <= 15_000 + 3_000
 
 
-def test_bad_minute_among_good_ones_does_not_move_drift() -> None:
+def test_bad_minutes_do_not_move_the_drift() -> None:
     other, rnd, estimator = Other(S, 50_000), random.Random(2), OffsetEstimator()
     for n in range(40):
         bad = 15 <= n < 25
-        there = queueing(5_000, 5_000) if bad else queueing(100, 50)
-        estimator.add(*second(other, n * S, there, queueing(100, 50), rnd))
+        way_back = queueing(5_000, 5_000) if bad else queueing(100, 50)
+        estimator.add(*second(other, n * S, way_back, queueing(100, 50), rnd))
     estimate = estimator.estimate(40 * S)
     assert estimate is not None
     assert estimate.drift == pytest.approx(50_000, abs=1_000)
@@ -134,9 +136,7 @@ def test_bad_minute_among_good_ones_does_not_move_drift() -> None:
 
 @given(st.floats(1.0, 100.0), st.floats(0.0, 2 * math.pi), st.integers(0, 2**32))
 @settings(max_examples=12, deadline=None)
-def test_drift_that_wanders_as_far_as_it_may_stays_inside(
-    period_s: float, phase: float, seed: int
-) -> None:
+def test_wandering_drift_stays_inside(period_s: float, phase: float, seed: int) -> None:
     """The offset's rate swings by a quarter of a part per million, so over any stretch within WANDER."""
     size = 250.0 * period_s / (2 * math.pi)
 
@@ -153,7 +153,7 @@ def test_drift_that_wanders_as_far_as_it_may_stays_inside(
 
 
 @pytest.mark.parametrize("step_ns", [S, -S, 2_000_000, -2_000_000])
-def test_a_clock_that_stepped_is_noticed_and_found_again(step_ns: int) -> None:
+def test_stepped_clocks_are_noticed_and_found_again(step_ns: int) -> None:
     rnd, estimator = random.Random(3), OffsetEstimator()
     before, after = Other(S, 30_000), Other(S + step_ns, 30_000)
     for n in range(30):
@@ -168,7 +168,7 @@ def test_a_clock_that_stepped_is_noticed_and_found_again(step_ns: int) -> None:
     assert estimate.low_ns <= after.offset(34 * S) <= estimate.high_ns
 
 
-def test_limits_that_contradict_each_other_alone_leave_nothing() -> None:
+def test_only_contradicting_limits_leave_nothing() -> None:
     estimator = OffsetEstimator()
     estimator.add(OffsetLimit(0, 10), OffsetLimit(0, 20_000_000))
     assert estimator.estimate(S) is None
@@ -177,7 +177,7 @@ def test_limits_that_contradict_each_other_alone_leave_nothing() -> None:
     assert estimator.estimate(S) is not None
 
 
-def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
+def test_memory_is_bounded_to_the_newest() -> None:
     other, estimator = Other(S, 0), OffsetEstimator()
     for n in range(3 * WINDOWS_KEPT):
         estimator.add(ceiling(other, n * S, 1000), floor(other, n * S, 1000))
@@ -188,22 +188,22 @@ def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
 
 
 def test_one_clock_needs_no_estimate() -> None:
-    one = exact_offset(0)
-    course = SlewedOffset(one)
+    offset = exact_offset(0)
+    course = SlewedOffset(offset)
     for at_ns in (-S, 0, 10**16):
-        assert one.extrapolate_ns(at_ns) == course.evaluate_ns(at_ns) == 0
-        assert one.error_bound_ns(at_ns, 0) == course.error_bound_ns(at_ns) == 0
-        assert one.error_bound_ns(at_ns, 7) == 7
+        assert offset.extrapolate_ns(at_ns) == course.evaluate_ns(at_ns) == 0
+        assert offset.error_bound_ns(at_ns, 0) == course.error_bound_ns(at_ns) == 0
+        assert offset.error_bound_ns(at_ns, 7) == 7
 
 
-def test_what_contradicts_an_estimate_widens_it() -> None:
-    one = exact_offset(5)
-    wider = one.widen(OffsetLimit(0, -100), None)
+def test_contradictions_widen_an_estimate() -> None:
+    offset = exact_offset(5)
+    wider = offset.widen(OffsetLimit(0, -100), None)
     assert (wider.low_ns, wider.high_ns, wider.offset_ns) == (-100, 5, 5)
-    assert one.widen(None, None) == one
+    assert offset.widen(None, None) == offset
 
 
-def test_people_read_seconds_and_microseconds() -> None:
+def test_offsets_are_printed_in_seconds_and_microseconds() -> None:
     assert format_offset(3_000_012_345, 84_001) == "offset 3.000012 s +- 85 us"
 
 
@@ -219,7 +219,7 @@ estimates = st.builds(
 
 
 @given(st.lists(st.tuples(estimates, st.integers(1, 3 * S)), min_size=1, max_size=6))
-def test_it_is_continuous_whatever_estimates_come_and_when(
+def test_the_used_offset_is_always_continuous(
     bends: list[tuple[OffsetEstimate, int]],
 ) -> None:
     course, now_ns = SlewedOffset(exact_offset(5)), 0
@@ -237,7 +237,7 @@ def test_it_is_continuous_whatever_estimates_come_and_when(
 
 
 @given(estimates)
-def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstimate) -> None:
+def test_used_offset_reaches_and_follows_its_estimate(estimate: OffsetEstimate) -> None:
     course = SlewedOffset(exact_offset(0))
     course.slew_to(0, estimate)
     for at_ns in (SLEW_NS, 2 * SLEW_NS, 10 * SLEW_NS):
@@ -246,10 +246,10 @@ def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstim
 
 @given(st.integers(0, 2**32), st.integers(-(10**12), 10**12), st.floats(-150_000, 150_000))
 @settings(max_examples=12, deadline=None)
-def test_the_truth_is_inside_its_bound_at_every_instant(
+def test_bounds_hold_the_truth_at_every_instant(
     seed: int, offset_ns: int, drift_ppb: float
 ) -> None:
-    """From the first exchange on, with estimates that come late, and through a silence of a minute."""
+    """From the first exchange on, with late estimates, and through a silence of a minute."""
     other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
     estimator.add(*second(other, 0, queueing(300, 1000), queueing(50, 1000), rnd, 3))
     first = estimator.estimate(S)

@@ -1,4 +1,4 @@
-"""Who is pinged answers at once; who pings learns where the other clock stands, to half a round trip."""
+"""Pinged members answer at once; the asker learns the offset of the other clock, to half a round trip."""
 
 import msgspec
 import pytest
@@ -27,14 +27,14 @@ from trilat_net.net.requests import Pong
 from trilat_net.net.wire import encode
 
 from .local_bus import LocalNetwork
-from .parties import SESSION, told
+from .parties import SESSION, answer_info
 
 S = 1_000_000_000
 STEP_NS = 1_000_000
 
 
 class Slow:
-    """A bus whose questions reach those who answer later, and whose answers come back later still."""
+    """A bus whose questions reach the responders later, and whose answers return later still."""
 
     def __init__(self, bus: Bus, clock: ManualClock, there_ns: int, back_ns: int) -> None:
         self._bus, self._clock, self._there_ns, self._back_ns = bus, clock, there_ns, back_ns
@@ -45,7 +45,7 @@ class Slow:
         return Slow.Late(self, key, payload, self._clock.monotonic_ns())
 
     class Late:
-        """Answers under way."""
+        """Answers on their way."""
 
         def __init__(self, slow: "Slow", key: str, payload: bytes, asked_ns: int) -> None:
             self._slow, self._key, self._payload, self._asked_ns = slow, key, payload, asked_ns
@@ -62,7 +62,7 @@ class Slow:
 
 
 class World:
-    """One who pings, and members on clocks of their own."""
+    """An asker, and members on clocks of their own."""
 
     def __init__(self, there_ns: int = 0, back_ns: int = 0) -> None:
         self.clock = ManualClock(10 * S)
@@ -75,7 +75,7 @@ class World:
     ) -> SkewedClock:
         clock = SkewedClock(self.clock, offset_ns, drift_ppb)
         answer_pings(
-            self.network.join(), clock, SESSION, told(name, boot, clock=clock.identity())
+            self.network.join(), clock, SESSION, answer_info(name, boot, clock=clock.identity())
         )
         return clock
 
@@ -93,7 +93,7 @@ class World:
     st.integers(0, 5 * S),
 )
 @settings(max_examples=25, deadline=None)
-def test_a_clock_is_known_to_half_a_round_trip(
+def test_clocks_are_known_to_half_round_trips(
     offset_ns: int, drift_ppb: int, there_ms: int, back_ms: int, later_ns: int
 ) -> None:
     world = World(there_ms * STEP_NS, back_ms * STEP_NS)
@@ -117,7 +117,7 @@ def test_a_clock_is_known_to_half_a_round_trip(
     )
 
 
-def test_pings_come_fast_until_all_are_known_and_then_rarely() -> None:
+def test_pings_slow_down_once_all_are_known() -> None:
     world = World()
     world.member("m2", 5, S)
     world.member("s", 7, 2 * S)
@@ -126,12 +126,12 @@ def test_pings_come_fast_until_all_are_known_and_then_rarely() -> None:
     assert not world.pinger.knows_clocks([5])
     world.wait(200_000_000, 5, 7)
     assert world.pinger.knows_clocks([5, 7])
-    asked = world.bus.asked
+    requests = world.bus.asked
     world.wait(5 * S, 5, 7)
-    assert world.bus.asked - asked == pytest.approx(5 * S / PING_REST_NS, abs=1)
+    assert world.bus.asked - requests == pytest.approx(5 * S / PING_REST_NS, abs=1)
 
 
-def test_where_no_clock_is_another_one_nobody_is_asked() -> None:
+def test_without_other_clocks_nobody_is_asked() -> None:
     world = World()
     world.wait(S)
     assert world.bus.asked == 0
@@ -140,7 +140,7 @@ def test_where_no_clock_is_another_one_nobody_is_asked() -> None:
     assert world.pinger.estimator(99) is None
 
 
-def test_poll_is_hurried_only_while_answer_is_under_way() -> None:
+def test_polls_hurry_only_while_answers_travel() -> None:
     world = World()
     world.member("s", 7)
     assert world.pinger.pause_ns(5_000_000) == 5_000_000
@@ -169,7 +169,7 @@ STRANGERS = {
 
 
 @pytest.mark.parametrize("payload", STRANGERS.values(), ids=STRANGERS.keys())
-def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
+def test_impossible_answers_are_ignored(payload: bytes) -> None:
     world = World()
     world.network.join().respond(topics.key(SESSION, "s", topics.PING), lambda _: payload)
     world.wait(S, 7)
@@ -177,7 +177,7 @@ def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
     assert all(not trips.rtts_ns for trips in world.pinger.trips.values())
 
 
-def test_a_stepping_clock_is_unknown_until_enough_messages_agree() -> None:
+def test_stepping_clocks_are_unknown_until_messages_agree() -> None:
     trips = RoundTrips(PINGS)
     for n in range(PINGS):
         trips.receive(
@@ -196,24 +196,24 @@ def test_a_stepping_clock_is_unknown_until_enough_messages_agree() -> None:
     assert trips.latest == before
 
 
-def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
+def test_answers_count_for_their_own_question() -> None:
     clock, network = ManualClock(S), LocalNetwork()
     questions = network.join().query_inbox("t/a")
     asking = RepeatedQuery(network.join(), clock, "t/*")
-    asked = []
+    asked_ticks = []
     for _ in range(3):
         asking.repeat(0)
-        asked.append(clock.monotonic_ns())
+        asked_ticks.append(clock.monotonic_ns())
         clock.sleep_until(clock.monotonic_ns() + S)
-    waiting = [questions.poll() for _ in asked]
+    waiting = [questions.poll() for _ in asked_ticks]
     for n in (2, 0, 1):
         waiting[n].reply(bytes([n]))
-    answers = [asking.poll() for _ in asked]
-    assert sorted(answers) == [(asked[n], "t/a", bytes([n])) for n in range(3)]
+    answers = [asking.poll() for _ in asked_ticks]
+    assert sorted(answers) == [(asked_ticks[n], "t/a", bytes([n])) for n in range(3)]
     assert asking.poll() is None
 
 
-def test_questions_that_are_too_old_are_forgotten() -> None:
+def test_old_questions_are_forgotten() -> None:
     network = LocalNetwork()
     questions = network.join().query_inbox("t/a")
     asking = RepeatedQuery(network.join(), ManualClock(), "t/a")

@@ -1,4 +1,6 @@
-"""The wire of ROS 2 over Zenoh: strings that rmw_zenoh documents, hashes that rosbags computes, a router."""
+"""The wire of ROS 2 over Zenoh: strings as documented by rmw_zenoh, hashes as computed by
+rosbags, a router.
+"""
 
 import json
 from collections.abc import Iterator
@@ -40,7 +42,7 @@ ADD_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c
 LISTENER = Ros2Member(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
 
 
-def test_keys_are_those_of_the_design_of_rmw_zenoh() -> None:
+def test_keys_follow_the_design_of_rmw_zenoh() -> None:
     assert topic_key(0, "chatter", STRING, find_type_hash(STRING, "jazzy")) == (
         f"0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}"
     )
@@ -52,7 +54,7 @@ def test_keys_are_those_of_the_design_of_rmw_zenoh() -> None:
     )
 
 
-def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
+def test_tokens_follow_the_design_of_rmw_zenoh() -> None:
     root = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0"
     assert LISTENER.token() == f"{root}/0/NN/%/%/listener"
     heard = (10, EndpointKind.SUBSCRIPTION, "chatter", STRING, STRING_HASH, QualityOfService())
@@ -85,7 +87,7 @@ def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
         (QualityOfService(depth=42), "::,:,:,:,,"),
     ],
 )
-def test_a_quality_of_service_leaves_out_the_defaults(qos: QualityOfService, text: str) -> None:
+def test_qualities_of_service_omit_the_defaults(qos: QualityOfService, text: str) -> None:
     assert qos.encode() == text
 
 
@@ -133,7 +135,7 @@ SERVICE = {
 
 
 @pytest.mark.parametrize("store", ["HUMBLE", "IRON", "JAZZY", "KILTED", "LYRICAL"])
-def test_hashes_of_types_are_those_of_every_distribution(store: str) -> None:
+def test_type_hashes_are_those_of_all_distributions(store: str) -> None:
     types = get_typestore(Stores[f"ROS2_{store}"])
     types.fielddefs.update(SERVICE)
     for kind, digest in TYPE_HASHES.items():
@@ -143,19 +145,19 @@ def test_hashes_of_types_are_those_of_every_distribution(store: str) -> None:
 @given(
     st.integers(1, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16)
 )
-def test_an_attachment_has_33_bytes_and_comes_back(
+def test_attachments_have_33_bytes_and_return(
     number: int, sent_unix_ns: int, gid: bytes
 ) -> None:
-    sent = Attachment(number, sent_unix_ns, gid)
-    assert len(sent.encode()) == 33
-    assert sent.encode()[16] == 0x10
-    assert parse_attachment(sent.encode()) == sent
+    attachment = Attachment(number, sent_unix_ns, gid)
+    assert len(attachment.encode()) == 33
+    assert attachment.encode()[16] == 0x10
+    assert parse_attachment(attachment.encode()) == attachment
 
 
 @given(st.binary(max_size=70))
-def test_what_is_no_attachment_is_none(data: bytes) -> None:
-    found = parse_attachment(data)
-    assert found is None or found.encode() == data
+def test_an_invalid_attachment_is_none(data: bytes) -> None:
+    attachment = parse_attachment(data)
+    assert attachment is None or attachment.encode() == data
 
 
 def test_names_of_endpoints_differ() -> None:
@@ -170,12 +172,12 @@ def test_names_of_endpoints_differ() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "/", "a//b", "a-b", "1a", "a/1", "a/", "é"])
-def test_a_name_that_ros_refuses_is_refused(name: str) -> None:
+def test_names_refused_by_ros_are_refused(name: str) -> None:
     with pytest.raises(UsageError, match="is not a valid ROS 2 name"):
         check_ros_name(name, "session")
 
 
-def test_a_name_of_ros_is_taken_without_its_slash() -> None:
+def test_ros_names_lose_their_leading_slash() -> None:
     assert check_ros_name("/lab/arm_1", "session") == "lab/arm_1"
 
 
@@ -194,7 +196,7 @@ def test_a_name_of_ros_is_taken_without_its_slash() -> None:
         (0, STRING, "RIHS01_0", "with another definition of std_msgs/msg/String, RIHS01_0"),
     ],
 )
-def test_a_publisher_that_does_not_fit_is_named(
+def test_mismatched_publishers_are_named(
     domain: int, kind: str, type_hash: str, misfit: str
 ) -> None:
     talker = Ros2Member(domain, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
@@ -207,12 +209,12 @@ def test_a_publisher_that_does_not_fit_is_named(
 @given(
     st.lists(st.text(max_size=9).filter(lambda part: "/" not in part), min_size=10, max_size=15)
 )
-def test_a_token_of_strangers_has_a_misfit_and_raises_nothing(parts: list[str]) -> None:
+def test_foreign_tokens_have_misfits_and_raise_nothing(parts: list[str]) -> None:
     assert describe_mismatch("/".join(parts), 0, STRING)
 
 
 class Wire:
-    """A router, a graph of ours at it, and a stranger who speaks Zenoh alone."""
+    """A router, a graph of ours at the router, and a stranger that uses Zenoh alone."""
 
     def __init__(self, place: str) -> None:
         self.place, self.said, self._kept = place, list[str](), list[Any]()
@@ -228,14 +230,14 @@ class Wire:
             publisher.put(data, attachment=attachment)
 
     def hears(self, key: str) -> list[bytes]:
-        """What comes to the stranger from now on, and of a latched topic what came before."""
-        came: list[bytes] = []
+        """Returns the stranger's messages from now on, and of a latched topic also the earlier ones."""
+        payloads: list[bytes] = []
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-        take = lambda sample: came.append(sample.payload.to_bytes())  # noqa: E731
+        take = lambda sample: payloads.append(sample.payload.to_bytes())  # noqa: E731
         self._kept.append(
             zenoh.ext.declare_advanced_subscriber(self.stranger, key, take, history=history)
         )
-        return came
+        return payloads
 
     def close(self) -> None:
         self.graph.__exit__()
@@ -250,16 +252,16 @@ def opened(mode: ZenohMode, place: str) -> Any:
 
 @pytest.fixture
 def wire() -> Iterator[Wire]:
-    with closing(Wire(*find_free_endpoints(1))) as made:
-        yield made
+    with closing(Wire(*find_free_endpoints(1))) as open_wire:
+        yield open_wire
 
 
 SENT = Attachment(1, 5, b"s" * 16)
 
 
-def test_a_message_of_another_type_or_unattached_is_refused(wire: Wire) -> None:
-    came: list[tuple[bytes, Attachment]] = []
-    wire.graph.subscribe("a", STRING, lambda data, sent: came.append((data, sent)))
+def test_messages_of_other_types_are_refused(wire: Wire) -> None:
+    messages: list[tuple[bytes, Attachment]] = []
+    wire.graph.subscribe("a", STRING, lambda data, sent: messages.append((data, sent)))
     right = topic_key(0, "a", STRING, STRING_HASH)
     for attachment in (None, b"", b"x" * 33):
         wire.say(right, b"bare", attachment)
@@ -269,30 +271,30 @@ def test_a_message_of_another_type_or_unattached_is_refused(wire: Wire) -> None:
         )
     wire.say(topic_key(0, "a", STRING, "TypeHashNotSupported"), b"humble", SENT.encode())
     wire.say(right, b"jazzy", SENT.encode())
-    until(lambda: len(came) == 2)
-    assert came == [(b"humble", SENT), (b"jazzy", SENT)]
+    until(lambda: len(messages) == 2)
+    assert messages == [(b"humble", SENT), (b"jazzy", SENT)]
     assert wire.graph.refusals.counts == {"a: a message without an attachment of ROS": 3}
 
 
-def test_a_message_that_raises_is_refused_and_the_next_comes(wire: Wire) -> None:
-    came: list[bytes] = []
+def test_raising_messages_are_refused_without_effect(wire: Wire) -> None:
+    payloads: list[bytes] = []
 
     def take(data: bytes, _: Attachment) -> None:
-        came.append(data)
+        payloads.append(data)
         raise ValueError("is none")
 
     wire.graph.subscribe("a", STRING, take)
     for data in (b"1", b"2"):
         wire.say(topic_key(0, "a", STRING, STRING_HASH), data, SENT.encode())
-    until(lambda: len(came) == 2)
+    until(lambda: len(payloads) == 2)
     until(lambda: wire.graph.refusals.counts == {"a is none": 2})
     assert wire.said == ["refused: a is none"]
 
 
-def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None:
+def test_mismatched_publishers_are_named_at_once(wire: Wire) -> None:
     wire.graph.subscribe("a", STRING, lambda *_, **__: None)
-    place = Ros2Member(3, str(wire.stranger.zid()), "", "talker")
-    token = place.endpoint_token(
+    ros_member = Ros2Member(3, str(wire.stranger.zid()), "", "talker")
+    token = ros_member.endpoint_token(
         1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()
     )
     with_token = wire.stranger.liveliness().declare_token(token)
@@ -305,7 +307,7 @@ def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None
     with_token.undeclare()
 
 
-def test_a_request_without_attachment_is_refused_and_unanswered(wire: Wire) -> None:
+def test_requests_without_attachment_get_no_answer(wire: Wire) -> None:
     wire.graph.serve("end", TRIGGER, lambda _: b"done")
     key = topic_key(0, "end", TRIGGER, find_type_hash(TRIGGER, "jazzy"))
 
@@ -314,14 +316,18 @@ def test_a_request_without_attachment_is_refused_and_unanswered(wire: Wire) -> N
 
     until(lambda: ask(attachment=SENT.encode()))
     (answer,) = ask(attachment=SENT.encode())
-    told = parse_attachment(answer.attachment.to_bytes())
-    assert told is not None
-    assert (answer.payload.to_bytes(), told.number, told.gid) == (b"done", 1, SENT.gid)
+    attachment = parse_attachment(answer.attachment.to_bytes())
+    assert attachment is not None
+    assert (answer.payload.to_bytes(), attachment.number, attachment.gid) == (
+        b"done",
+        1,
+        SENT.gid,
+    )
     assert ask() == []
     assert wire.said == ["refused: end: a request without an attachment of ROS"]
 
 
-def test_a_router_that_comes_back_carries_every_topic_again(wire: Wire) -> None:
+def test_returning_routers_carry_every_topic_again(wire: Wire) -> None:
     plain = wire.graph.publisher("a", STRING, QualityOfService())
     latched = wire.graph.publisher("b", STRING, QualityOfService(latched=True, depth=1))
     latched.put(b"kept")
@@ -342,15 +348,15 @@ def test_a_router_that_comes_back_carries_every_topic_again(wire: Wire) -> None:
         assert (now, kept) == ([b"now"], [b"kept"])
 
 
-def test_a_peer_forwards_nothing_and_is_named_with_the_cure() -> None:
-    (place,) = find_free_endpoints(1)
+def test_peers_forward_nothing_and_name_the_cure() -> None:
+    (endpoint,) = find_free_endpoints(1)
     with (
-        closing(opened("peer", place)),
+        closing(opened("peer", endpoint)),
         pytest.raises(UsageError, match=r"is not a router.*rmw_zenohd"),
     ):
-        Ros2Graph(Refusals(print), [place], "play", "trilat", SystemClock())
+        Ros2Graph(Refusals(print), [endpoint], "play", "trilat", SystemClock())
 
 
-def test_a_router_that_is_not_there_is_silent() -> None:
+def test_an_absent_router_is_silent() -> None:
     with pytest.raises(RouterSilent, match="no router of ROS answers at tcp"):
         Ros2Graph(Refusals(print), find_free_endpoints(1), "play", "trilat", SystemClock())

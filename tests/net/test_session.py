@@ -1,4 +1,4 @@
-"""One epoch whatever the start order; nobody starts without `start`; strangers change nothing."""
+"""One epoch for any order of starts; no member starts without `start`; strangers change nothing."""
 
 import re
 from collections.abc import Callable
@@ -17,21 +17,21 @@ from trilat_net.net.session import DECIDE_NS, EPOCH_AHEAD_NS
 from trilat_net.net.wire import encode
 
 from .local_bus import LocalNetwork
-from .parties import SESSION, STEP_NS, Member, Party, told
+from .parties import SESSION, STEP_NS, Member, Party, answer_info
 
 SITES = ("m1", "m2", "s")
 RECORDER = topics.RECORDER
 
 
 def party(*names: str) -> Party:
-    made = Party(SITES)
-    made.start(*names)
-    return made
+    session_party = Party(SITES)
+    session_party.start(*names)
+    return session_party
 
 
 @st.composite
 def lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
-    """The members of a session, and what happens to them in which order before all are there."""
+    """The members of a session, and their events in any order before all are present."""
     sites = [f"site{n}" for n in range(draw(st.integers(2, 5)))]
     members = [*sites, RECORDER] if draw(st.booleans()) else sites
     happenings = st.tuples(
@@ -42,7 +42,7 @@ def lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
 
 @given(lives())
 @settings(max_examples=50)
-def test_one_epoch_whatever_the_order_of_starts_deaths_and_polls(
+def test_all_orders_of_starts_give_one_epoch(
     life: tuple[list[str], list[tuple[str, str]]],
 ) -> None:
     members, happenings = life
@@ -71,13 +71,13 @@ def test_one_epoch_whatever_the_order_of_starts_deaths_and_polls(
     assert announced.boots == epoch.boots
 
 
-def test_the_epoch_lies_ahead_of_everybody() -> None:
+def test_the_epoch_lies_ahead_of_all_members() -> None:
     session = party(*SITES)
     epoch = session.agreed()
     assert epoch.mono_ns - session.clock.monotonic_ns() >= DECIDE_NS - STEP_NS
 
 
-def test_nobody_starts_without_start() -> None:
+def test_no_member_starts_without_start() -> None:
     session = party(*SITES)
     leader = session.members["m1"]
     for _ in range(200):  # the leader does not poll: nothing is announced
@@ -97,7 +97,7 @@ def test_nobody_starts_without_start() -> None:
     assert session.agreed() == leader.epoch
 
 
-def test_who_is_not_ready_in_time_gets_another_attempt() -> None:
+def test_slow_members_get_another_attempt() -> None:
     session = party(*SITES)
     while "epoch" not in session.kinds():
         session.round("m1", "m2")
@@ -121,7 +121,7 @@ def test_a_leader_that_comes_last_leads() -> None:
     }
 
 
-def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
+def test_members_lost_before_starts_are_awaited() -> None:
     session = party(*SITES)
     while "epoch" not in session.kinds():
         session.round()
@@ -133,7 +133,7 @@ def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
     session.agreed()
 
 
-def test_leader_lost_before_start_is_followed_by_its_next_start() -> None:
+def test_leaders_lost_before_starts_are_replaced() -> None:
     session = party(*SITES)
     while session.kinds().count("ready") < 2:
         session.round("m1")
@@ -143,7 +143,7 @@ def test_leader_lost_before_start_is_followed_by_its_next_start() -> None:
     assert session.agreed().boots["m1"] == session.members["m1"].info.boot
 
 
-def test_a_recorder_that_announces_itself_is_waited_for() -> None:
+def test_announced_recorders_are_awaited() -> None:
     session = party(*SITES)
     # there, and not joining yet
     session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")
@@ -155,7 +155,7 @@ def test_a_recorder_that_announces_itself_is_waited_for() -> None:
 
 
 @pytest.mark.parametrize("who", SITES)
-def test_a_recorder_that_any_site_needs_is_waited_for(who: str) -> None:
+def test_recorders_needed_by_any_site_are_awaited(who: str) -> None:
     session = Party(SITES)
     for name in SITES:
         session.start(name, needs_recorder=name == who)
@@ -165,7 +165,7 @@ def test_a_recorder_that_any_site_needs_is_waited_for(who: str) -> None:
     assert RECORDER in session.agreed().boots
 
 
-def test_missing_names_who_is_missing() -> None:
+def test_missing_members_are_named() -> None:
     session = party("m2")
     assert session.members["m2"].joining.membership.list_missing() == ["m1", "s"]
     session.start("s")
@@ -173,7 +173,7 @@ def test_missing_names_who_is_missing() -> None:
     assert session.members["m2"].joining.membership.list_missing() == ["m1"]
 
 
-def test_another_scenario_is_refused_by_both_hashes_on_both_sides() -> None:
+def test_other_scenarios_are_refused_by_both_hashes() -> None:
     other = "a1" * 32
     session = party("m1", "m2")
     session.start("s", scenario_sha256=other)
@@ -189,7 +189,7 @@ def test_another_scenario_is_refused_by_both_hashes_on_both_sides() -> None:
     session.agreed()
 
 
-def test_a_refusal_is_said_once_for_each_start() -> None:
+def test_refusals_are_reported_once_per_start() -> None:
     session = party("m1", "m2")
     stubborn = session.member("s", scenario_sha256="a1" * 32)
     for _ in range(100):
@@ -214,7 +214,7 @@ def polled_until_refused(*members: Member, clock: ManualClock) -> list[str]:
 
 @pytest.mark.parametrize("name", SITES)
 @pytest.mark.parametrize("boots", [(7, 9), (9, 7)])
-def test_of_two_starts_of_one_site_one_goes(name: str, boots: tuple[int, int]) -> None:
+def test_of_two_starts_one_leaves(name: str, boots: tuple[int, int]) -> None:
     session = Party(SITES)
     twins = [session.member(name, boot=boot) for boot in boots]
     others = [session.member(other) for other in SITES if other != name]
@@ -226,7 +226,7 @@ def test_of_two_starts_of_one_site_one_goes(name: str, boots: tuple[int, int]) -
     assert sum(member.epoch is not None for member in (*twins, *others)) == 3
 
 
-def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
+def test_split_leaders_cannot_split_a_session() -> None:
     """Two starts of m1 whose answers do not reach each other; the others hear both."""
     session = Party(SITES)
     twins = [session.member("m1", boot=boot) for boot in (7, 9)]
@@ -245,7 +245,7 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
 
 
 @pytest.mark.parametrize("name", SITES)
-def test_whoever_joins_a_running_session_is_refused(name: str) -> None:
+def test_joining_a_running_session_is_refused(name: str) -> None:
     session = party(*SITES)
     epoch = session.agreed()
     late = session.member(name)
@@ -265,9 +265,7 @@ def test_whoever_joins_a_running_session_is_refused(name: str) -> None:
     unix_ns=st.integers(0, 2**60),
 )
 @settings(max_examples=15)
-def test_members_on_other_clocks_begin_at_the_same_instant(
-    ahead_ns: dict[str, int], unix_ns: int
-) -> None:
+def test_other_clocks_begin_at_the_same_instant(ahead_ns: dict[str, int], unix_ns: int) -> None:
     session = Party(SITES)
     clocks = {
         name: session.elsewhere(ns, unix_ns + ns, f"machine of {name}")
@@ -287,7 +285,7 @@ def test_members_on_other_clocks_begin_at_the_same_instant(
         assert epoch.epochs == epochs["m1"].epochs
 
 
-def test_nobody_is_ready_before_the_other_clocks_are_known() -> None:
+def test_readiness_needs_all_other_clocks() -> None:
     session = party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
     bus, deaf = session.members["m2"].bus, LocalNetwork().join().inbox("nothing")
@@ -302,7 +300,7 @@ def test_nobody_is_ready_before_the_other_clocks_are_known() -> None:
     assert all(member.epoch for member in session.members.values())
 
 
-def test_an_epoch_lies_further_ahead_where_the_network_is_slow() -> None:
+def test_slow_networks_get_later_epochs() -> None:
     """Announcement, answer and start each need a way: the margin grows with the leader's round trips."""
     session = party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
@@ -319,7 +317,7 @@ def test_an_epoch_lies_further_ahead_where_the_network_is_slow() -> None:
 
 
 def later(ask: Callable[..., Inbox], clock: ManualClock, after_ns: int) -> Callable[..., Inbox]:
-    """Asks at once, and hears the answers so much later."""
+    """Asks at once, and gets the answers later."""
 
     class Late:
         def __init__(self, inbox: Inbox) -> None:
@@ -354,11 +352,11 @@ GARBAGE.append(bytes(70_000))
 
 
 @pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])
-def test_garbage_keeps_no_session_from_beginning(name: str) -> None:
+def test_garbage_delays_no_session(name: str) -> None:
     session = party(*SITES)
-    asked = session.stranger.query_inbox(topics.key(SESSION, name, topics.INFO))
+    answers = session.stranger.query_inbox(topics.key(SESSION, name, topics.INFO))
     for _ in range(30):
-        query = asked.poll()
+        query = answers.poll()
         for payload in GARBAGE:
             session.say(name, payload)
             if query is not None:
@@ -367,7 +365,7 @@ def test_garbage_keeps_no_session_from_beginning(name: str) -> None:
     session.agreed()
 
 
-def test_tokens_that_are_none_of_ours_are_passed_over() -> None:
+def test_foreign_tokens_are_ignored() -> None:
     session = party(*SITES)
     for token in (f"trilat/{SESSION}/m1/alive/xyz", f"trilat/{SESSION}/stranger/alive/0x1"):
         session.stranger.announce(token)
@@ -402,7 +400,7 @@ FORGED = {
 
 
 @pytest.mark.parametrize("event", FORGED.values(), ids=FORGED.keys())
-def test_events_that_fit_no_announcement_change_nothing(event: Event) -> None:
+def test_unannounced_events_change_nothing(event: Event) -> None:
     session = party(*SITES)
     for _ in range(30):
         session.say(event.member, encode(event))
@@ -412,22 +410,22 @@ def test_events_that_fit_no_announcement_change_nothing(event: Event) -> None:
     }
 
 
-def test_an_answer_under_the_key_of_another_counts_for_nobody() -> None:
+def test_answers_under_foreign_keys_do_not_count() -> None:
     session = party("m1", "m2")
-    asked = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
+    answers = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
     for _ in range(50):
-        while (question := asked.poll()) is not None:
-            question.reply(encode(told("s", 1)))
+        while (question := answers.poll()) is not None:
+            question.reply(encode(answer_info("s", 1)))
         session.round()
     assert session.members["m1"].joining.membership.list_missing() == ["s"]
 
 
-def test_what_another_version_answers_is_remembered_for_the_error() -> None:
+def test_answers_of_other_versions_enter_the_error() -> None:
     session = party("m1", "m2")
-    asked = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
-    newer: Info = told("s", 1, v=VERSION + 1)
+    answers = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
+    newer: Info = answer_info("s", 1, v=VERSION + 1)
     for _ in range(50):
-        while (question := asked.poll()) is not None:
+        while (question := answers.poll()) is not None:
             question.reply(encode(newer))
         session.round()
     assert session.members["m1"].joining.membership.list_missing() == ["s"]

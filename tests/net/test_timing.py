@@ -1,4 +1,6 @@
-"""Deadlines follow the leader's grid by slewing; stamps give true delays and offsets within their bounds."""
+"""Deadlines follow the leader's grid by slewing; stamps give true delays and offsets within
+their bounds.
+"""
 
 import heapq
 import random
@@ -52,7 +54,7 @@ class Site:
 
 
 class Session:
-    """Two sites, a leads; messages take as long as the ways say, in true time."""
+    """Two sites, led by a; messages travel as the ways say, in true time."""
 
     def __init__(
         self, skews: tuple[tuple[int, int], tuple[int, int]], ways: tuple[Delay, Delay]
@@ -125,7 +127,7 @@ LAN = queueing(80, 60)
 
 
 @pytest.mark.parametrize("skew", [(-2 * S, -100_000), (86_400 * S, 30_000)])
-def test_delays_are_inside_their_bound_and_grid_follows_leader(skew: tuple[int, int]) -> None:
+def test_delays_stay_inside_bounds_and_grid_follows(skew: tuple[int, int]) -> None:
     session = Session(((0, 0), skew), (LAN, queueing(140, 90)))
     session.run(20.0)
     for site in session.sites:
@@ -145,19 +147,19 @@ def test_delays_are_inside_their_bound_and_grid_follows_leader(skew: tuple[int, 
     assert all(abs(stats["slew_ppb"]) <= SLEW_LIMIT for stats in follower.stats)
 
 
-def test_what_is_logged_is_true() -> None:
+def test_logged_figures_are_true() -> None:
     session = Session(((0, 0), (3 * S, 100_000)), (LAN, LAN))
     session.run(12.0)
     site, start_ns = session.sites[0], 10**12
-    told = [news for news in site.news if news["kind"] == "clock"]
-    assert len(told) >= 12
-    for news in told:
+    clock_events = [news for news in site.news if news["kind"] == "clock"]
+    assert len(clock_events) >= 12
+    for news in clock_events:
         assert news["about"] == "b"
         at_ns = start_ns + S + news["ticks"] * S // RATE_HZ
         truth = 3 * S + (at_ns - start_ns) // 10_000
         assert abs(news["offset_ns"] - truth) <= news["bound_ns"] + 50
         assert abs(news["drift_ppb"] - 100_000) <= news["drift_bound_ppb"]
-    last = told[-1]
+    last = clock_events[-1]
     assert abs(last["drift_ppb"] - 100_000) <= 5_000
     assert "offset 3.00" in last["text"]
     assert "ppm" in last["text"]
@@ -175,7 +177,7 @@ ways = st.tuples(st.floats(0, 5000), st.floats(1, 5000))
 
 @given(skews, skews, ways, ways, st.integers(0, 600), st.integers(0, 600))
 @settings(max_examples=8, deadline=None)
-def test_bounds_hold_whatever_the_clocks_the_ways_and_the_outage(
+def test_bounds_hold_for_any_clocks_and_ways(
     one: Pair, two: Pair, there: Pair, back: Pair, begin: int, ticks: int
 ) -> None:
     session = Session((one, two), (queueing(*there), queueing(*back)))
@@ -186,7 +188,7 @@ def test_bounds_hold_whatever_the_clocks_the_ways_and_the_outage(
 
 
 @pytest.mark.parametrize("step_ns", [S, -3_000_000])
-def test_clock_that_steps_is_fault_once_second_and_found_again(step_ns: int) -> None:
+def test_stepping_clocks_are_faults_and_found_again(step_ns: int) -> None:
     session = Session(((0, 0), (3 * S, 0)), (LAN, LAN))
     session.step_at = {1: (4 * RATE_HZ, step_ns)}
     session.run(10.0)
@@ -200,8 +202,10 @@ def test_clock_that_steps_is_fault_once_second_and_found_again(step_ns: int) -> 
 
 
 def meter(estimator: OffsetEstimator | None = None) -> tuple[LinkTimingMonitor, SentStamps]:
-    sent = SentStamps(8)
-    return LinkTimingMonitor(PeerClock("b", 1000, 3, exact_offset(0), estimator), sent), sent
+    sent_stamps = SentStamps(8)
+    return LinkTimingMonitor(
+        PeerClock("b", 1000, 3, exact_offset(0), estimator), sent_stamps
+    ), sent_stamps
 
 
 def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
@@ -211,7 +215,7 @@ def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
     )
 
 
-def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
+def test_on_one_clock_delays_are_exact() -> None:
     link, sent = meter()
     sent.record(7, 5_000)
     assert link.receive(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
@@ -220,7 +224,7 @@ def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
     assert link.offset.bound_ns == 0
 
 
-def test_echo_of_what_is_not_known_any_more_says_nothing() -> None:
+def test_echoes_of_forgotten_stamps_are_ignored() -> None:
     link, sent = meter()
     for tick in range(20):
         sent.record(tick, tick)
@@ -230,7 +234,7 @@ def test_echo_of_what_is_not_known_any_more_says_nothing() -> None:
     assert sent.find_ns(11) is None
 
 
-def test_figures_are_of_the_last_window_and_faults_of_all() -> None:
+def test_figures_cover_windows_and_faults_cover_everything() -> None:
     link, _ = meter()
     for n, delay_ns in enumerate((3_000, 1_000, 900_000, -5_000)):
         link.receive(sample(n, 0), 1000 + delay_ns)
@@ -239,7 +243,7 @@ def test_figures_are_of_the_last_window_and_faults_of_all() -> None:
     assert link.worst_ns == 5_000
 
 
-def test_the_echo_is_of_the_newest_sample_and_said_once() -> None:
+def test_the_newest_sample_is_echoed_once() -> None:
     peers = [PeerClock(name, 0, 0, exact_offset(0), None) for name in ("b", "c")]
     timing = SiteTiming(0, 1000, peers, "a")
     one, two = timing.monitors
@@ -264,7 +268,7 @@ def test_the_first_windows_are_short() -> None:
     assert closed[FIRST_WINDOWS] - closed[FIRST_WINDOWS - 1] == S
 
 
-def test_who_shares_the_leaders_clock_is_not_steered() -> None:
+def test_members_on_the_leaders_clock_need_no_steering() -> None:
     timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, exact_offset(0), None)], "a")
     for k in range(0, 5000, 100):
         timing.monitors[0].receive(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
@@ -274,21 +278,19 @@ def test_who_shares_the_leaders_clock_is_not_steered() -> None:
 
 
 @given(st.integers(1, 30), st.integers(1, 4000))
-def test_turns_of_a_machine_lie_within_half_a_period(sites: int, rate_hz: int) -> None:
-    turns = [find_turn_ns(place, sites, rate_hz) for place in range(sites)]
+def test_turns_lie_within_half_a_period(sites: int, rate_hz: int) -> None:
+    turns = [find_turn_ns(index, sites, rate_hz) for index in range(sites)]
     assert turns[0] == 0
     assert 2 * turns[-1] * rate_hz < S
-    apart = [later - turn for turn, later in pairwise(turns)]
-    assert max(apart, default=0) - min(apart, default=0) <= 1
+    intervals = [later - turn for turn, later in pairwise(turns)]
+    assert max(intervals, default=0) - min(intervals, default=0) <= 1
 
 
 EPOCH_NS = 5_000_000_123
 
 
 @given(st.integers(0, 10**9), st.integers(1, 4000))
-def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(
-    k: int, rate_hz: int
-) -> None:
+def test_unsteered_grids_are_absolute_to_the_nanosecond(k: int, rate_hz: int) -> None:
     assert TickSchedule(EPOCH_NS, rate_hz).due_ns(k) == EPOCH_NS + k * S // rate_hz
 
 
@@ -299,7 +301,7 @@ def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(
     ),
     st.sampled_from([333, 1000, 4000]),
 )
-def test_it_never_steps_and_never_slews_beyond_the_limit(
+def test_steering_never_steps_or_exceeds_its_slew(
     steers: list[tuple[int, int, float]], rate_hz: int
 ) -> None:
     grid, k = TickSchedule(EPOCH_NS, rate_hz), 0
@@ -317,9 +319,7 @@ def test_it_never_steps_and_never_slews_beyond_the_limit(
 
 @pytest.mark.parametrize("drift_ppb", [-150_000, -100_000, 0, 37_000, 150_000])
 @pytest.mark.parametrize("begin_ns", [-400_000, 0, 400_000])
-def test_it_follows_the_leaders_grid_on_a_clock_that_drifts(
-    drift_ppb: int, begin_ns: int
-) -> None:
+def test_steered_grids_follow_the_leaders_drifting_clock(drift_ppb: int, begin_ns: int) -> None:
     """From an epoch that was converted wrong by begin_ns, steered ten times a second by the true offset."""
     leader = Other(0, drift_ppb)
     grid = TickSchedule(begin_ns, 1000)

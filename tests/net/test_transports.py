@@ -1,4 +1,6 @@
-"""The table of transports on docs/sessions/network.md: what arrives over each, and which ones are refused."""
+"""The table of transports on docs/sessions/network.md: the samples that arrive over each, and
+which transports are refused.
+"""
 
 from contextlib import closing
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Messages on the wire: every finite number bit for bit, and nothing else gets through."""
+"""Messages on the wire: every finite number bit for bit, and invalid messages are refused."""
 
 import json
 import math
@@ -42,7 +42,7 @@ from trilat_net.net.wire import (
     split_states,
 )
 
-from .parties import told
+from .parties import answer_info
 
 STATE_VECTORS = Layout().lengths()
 
@@ -111,7 +111,7 @@ def sample(**changes: Any) -> bytes:
 
 @settings(max_examples=40)
 @given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
-def test_a_record_comes_back_bit_for_bit(
+def test_records_return_bit_for_bit(
     output: TickRecord, came: list[Arrival], boot: int, late_us: int
 ) -> None:
     data = encode_state("m1", boot, PEERS, output, came, late_us, 12)
@@ -137,7 +137,7 @@ instants = st.integers(-(2**59), 2**59 - 1)
     sent_ns=instants,
     echo=st.lists(st.tuples(st.integers(0, 1), ticks, instants)),
 )
-def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
+def test_stamps_return_and_are_nominal_in_virtual_time(
     output: TickRecord, sent_ns: int, echo: list[tuple[int, int, int]]
 ) -> None:
     message = decode(encode_state("m1", 1, PEERS, output, [], 0, 0, sent_ns, echo), State)
@@ -147,7 +147,7 @@ def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
     assert (virtual.sent_ns, virtual.echo) == (output.t_ns, [])
 
 
-def test_a_version_1_record_is_read_in_files_only() -> None:
+def test_version_1_records_are_read_in_files() -> None:
     record = msgpack.unpackb(payload(v=1))
     first = msgpack.packb(
         {name: record[name] for name in record if name not in ("sent_ns", "echo")}
@@ -170,7 +170,7 @@ pose = st.one_of(st.just(()), row(3))
     task=st.tuples(pose, row(3), row(3)),
     echo=st.lists(st.tuples(ticks, ticks, instants), max_size=MOST_PEERS),
 )
-def test_each_field_of_a_sample_is_one_of_its_record(
+def test_sample_fields_equal_their_records(
     output: TickRecord,
     task: tuple[list[float], list[float], list[float]],
     echo: list[tuple[int, int, int]],
@@ -191,32 +191,32 @@ def test_each_field_of_a_sample_is_one_of_its_record(
 
 
 @given(st.lists(st.integers(0, 20_000), min_size=1, max_size=12))
-def test_blocks_hold_records_in_order_and_as_they_were(sizes: list[int]) -> None:
+def test_blocks_hold_unchanged_records_in_order(sizes: list[int]) -> None:
     records = [payload(tick=n, cmd=["x" * size]) for n, size in enumerate(sizes)]
     blocks = list(join_states(records))
-    assert [one for block in blocks for one in split_states(block)] == records
+    assert [state for block in blocks for state in split_states(block)] == records
     assert all(len(block) <= max(BACKFILL_BYTES, *map(len, records)) for block in blocks)
     assert list(split_states(records[0])) == [records[0]]
 
 
 @given(st.integers(1, 3), st.integers(1, 200))
-def test_of_block_that_is_cut_records_before_are_there(whole: int, cut: int) -> None:
+def test_cut_blocks_keep_earlier_records(whole: int, cut: int) -> None:
     records = [payload(tick=n) for n in range(whole)]
-    came = split_states(b"".join([*records, payload()[:cut]]))
-    assert [next(came) for _ in records] == records
+    states = split_states(b"".join([*records, payload()[:cut]]))
+    assert [next(states) for _ in records] == records
     with pytest.raises(WireError, match="malformed"):
-        next(came)
+        next(states)
 
 
 @pytest.mark.parametrize("block", [b"", bytes(MAX_BYTES + 1), b"\xc1", b"\x91" * 10_000])
-def test_what_is_no_block_is_refused(block: bytes) -> None:
+def test_an_invalid_block_is_refused(block: bytes) -> None:
     with pytest.raises(WireError):
         list(split_states(block))
 
 
 @settings(max_examples=30)
 @given(output=outputs, came=arrivals)
-def test_msgspec_writes_what_is_read_just_so(output: TickRecord, came: list[Arrival]) -> None:
+def test_msgspec_and_msgpack_agree(output: TickRecord, came: list[Arrival]) -> None:
     """Either library reads the other's bytes."""
     state = decode(encode_state("m1", 1, PEERS, output, came, 0, 0), State)
     again = decode(msgspec.msgpack.encode(state), State)
@@ -228,7 +228,7 @@ def test_msgspec_writes_what_is_read_just_so(output: TickRecord, came: list[Arri
 
 @settings(max_examples=40)
 @given(outputs, st.sampled_from(sorted(STATE_VECTORS)), not_finite, st.integers(0, 1))
-def test_what_is_not_finite_is_refused_at_both_ends(
+def test_infinite_numbers_are_refused_at_both_ends(
     output: TickRecord, name: str, value: float, entry: int
 ) -> None:
     numbers = [*getattr(output, name)]
@@ -253,7 +253,7 @@ def test_what_is_not_finite_is_refused_at_both_ends(
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_law_sends_as_many_numbers_as_it_declares_each_finite(count: int) -> None:
+def test_laws_send_their_declared_finite_numbers(count: int) -> None:
     numbers = [0.5] * count
     for kind, data in {State: payload(ch=numbers), PeerSample: sample(ch=numbers)}.items():
         assert decode(data, kind, layout=Layout(sent=count)).ch == numbers
@@ -298,9 +298,7 @@ def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
         ({"echo": [[0, 1]]}, "malformed"),
     ],
 )
-def test_what_is_no_record_of_ours_is_refused_by_reason(
-    changes: dict[str, Any], reason: str
-) -> None:
+def test_invalid_records_are_refused_by_reason(changes: dict[str, Any], reason: str) -> None:
     of_both = changes.keys() <= {*PeerSample.__struct_fields__, "stranger"}
     for kind, data in ((State, payload(**changes)), (PeerSample, sample(**changes)))[
         : 1 + of_both
@@ -311,7 +309,7 @@ def test_what_is_no_record_of_ours_is_refused_by_reason(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_oversized_payload_is_refused_before_it_is_looked_at(kind: type) -> None:
+def test_oversized_payloads_are_refused_unread(kind: type) -> None:
     limit = MAX_INFO_BYTES if kind is Info else MAX_BYTES
     with pytest.raises(WireError) as refused:
         decode(b"\xc1" * (limit + 1), kind)
@@ -319,7 +317,7 @@ def test_an_oversized_payload_is_refused_before_it_is_looked_at(kind: type) -> N
 
 
 def only_wire_errors(data: bytes) -> None:
-    """Whatever the bytes: each kind of message comes out whole, or `WireError` does."""
+    """Asserts that bytes of any kind are decoded whole or raise `WireError`."""
     for kind in KINDS:
         try:
             message = decode(data, kind)
@@ -383,7 +381,7 @@ def test_deep_nesting_is_refused(opening: bytes) -> None:
         decode(data, PeerSample)
 
 
-def test_lengths_that_promise_more_than_there_is_are_refused() -> None:
+def test_false_lengths_are_refused() -> None:
     for head in (kind + b"\xff" * 4 for kind in (b"\xdf", b"\xdd", b"\xdb", b"\xc6")):
         only_wire_errors(head)
         only_wire_errors(payload(q=0)[:-1] + head)
@@ -395,7 +393,7 @@ def test_lengths_that_promise_more_than_there_is_are_refused() -> None:
     boot=boots,
     others=st.dictionaries(st.text(max_size=8), boots, max_size=3),
 )
-def test_events_come_back(kind: str, text: str, boot: int, others: dict[str, int]) -> None:
+def test_events_return(kind: str, text: str, boot: int, others: dict[str, int]) -> None:
     event = Event(
         member="m1", boot=boot, kind=kind, text=text, boots=others, epoch_mono_ns=2**58
     )
@@ -407,8 +405,8 @@ def test_events_come_back(kind: str, text: str, boot: int, others: dict[str, int
     boot=boots,
     tick=ticks,
 )
-def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick: int) -> None:
-    own = {"v": VERSION, "site": "m1", "boot": boot, "tick": tick, "t_ns": 5, "mode": "run"}
+def test_statistics_and_infos_return(counts: dict[str, int], boot: int, tick: int) -> None:
+    facts = {"v": VERSION, "site": "m1", "boot": boot, "tick": tick, "t_ns": 5, "mode": "run"}
     each = (
         "age_us",
         "accepted",
@@ -426,17 +424,17 @@ def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick:
         "grid_error_us": -4,
         "slew_ppb": 5,
     }
-    stats = LinkStats(**own, **dict.fromkeys((*each, "delay_us"), counts), **whole)
+    stats = LinkStats(**facts, **dict.fromkeys((*each, "delay_us"), counts), **whole)
     assert decode(encode(stats), LinkStats) == stats
-    info = told("s", boot)
+    info = answer_info("s", boot)
     assert decode(encode(info), Info) == info
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_json_schema_is_an_object_that_names_every_field(
+def test_json_schemas_are_objects_naming_every_field(
     kind: type[msgspec.Struct],
 ) -> None:
-    """What viewers accept: an object at the root, no reference out of it, plain JSON."""
+    """The form that viewers accept: an object at the root, no reference out of it, plain JSON."""
     schema = json_schema(kind)
     assert schema["type"] == "object"
     assert set(schema["properties"]) == set(kind.__struct_fields__)
@@ -446,15 +444,15 @@ def test_the_json_schema_is_an_object_that_names_every_field(
     assert "$id" not in text
 
 
-def test_the_json_schema_knows_units() -> None:
+def test_json_schemas_have_units() -> None:
     schema = json_schema(State)
     assert schema["properties"]["q"]["x-unit"] == "rad"
     assert schema["properties"]["tau"]["x-unit"] == "N m"
 
 
 @pytest.mark.long
-def test_the_schemas_of_a_log_are_the_same_without_docstrings() -> None:
-    """`python -OO` takes these away; a log has its schemas in it, and in its digests."""
+def test_schemas_are_equal_without_docstrings() -> None:
+    """`python -OO` removes docstrings; a log has its schemas in its text and in its digests."""
     kinds = (State, LinkStats, Event)
     program = (
         "import json\nfrom trilat_net.net.messages import Event, LinkStats, State, json_schema\n"
@@ -466,7 +464,7 @@ def test_the_schemas_of_a_log_are_the_same_without_docstrings() -> None:
     assert json.loads(done.stdout) == [json_schema(kind) for kind in kinds]
 
 
-def test_records_that_wait_are_read_past_what_strangers_send() -> None:
+def test_waiting_records_are_read_despite_strangers() -> None:
     ring: BoundedRing[tuple[str, bytes]] = BoundedRing(9)
     one, two, bad = payload(tick=1), payload(tick=2), b"\xc1"
     for sent in (one + two, b"no record", one + bad + two, b"", two):

@@ -1,4 +1,6 @@
-"""What the contract of `Bus` does not say: endpoints, encryption, and routers that end and begin again."""
+"""Rules of the real bus beyond the contract of `Bus`: endpoints, encryption, and routers that
+end and begin again.
+"""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -12,10 +14,10 @@ from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
 from .networks import Routed, encrypted, meet
-from .waiting import answered, received, until
+from .waiting import query_once, received, until
 
 
-def test_a_busy_port_is_the_callers_error_and_named() -> None:
+def test_busy_ports_are_the_callers_named_error() -> None:
     (endpoint,) = find_free_endpoints(1)
     first = ZenohBus([endpoint])
     try:
@@ -25,8 +27,8 @@ def test_a_busy_port_is_the_callers_error_and_named() -> None:
         first.close()
 
 
-def test_a_message_of_no_member_is_not_taken_in() -> None:
-    """Rings hold hundreds of messages; of hundreds of megabytes they would fill a memory."""
+def test_messages_without_member_are_refused() -> None:
+    """Rings hold hundreds of messages, which at hundreds of megabytes each would fill the memory."""
     (endpoint,) = find_free_endpoints(1)
     with closing(ZenohBus([endpoint])) as here, closing(ZenohBus([], [endpoint])) as there:
         inbox, publish = (
@@ -44,28 +46,32 @@ def test_a_message_of_no_member_is_not_taken_in() -> None:
 
 @pytest.mark.parametrize("endpoint", ["", "nonsense", "tcp/", "carrier-pigeon/1:2"])
 @pytest.mark.parametrize("side", ["listen", "connect"])
-def test_a_malformed_endpoint_is_the_callers_error(endpoint: str, side: str) -> None:
+def test_malformed_endpoints_are_the_callers_error(endpoint: str, side: str) -> None:
     with pytest.raises(UsageError, match="cannot"):
         ZenohBus(**{side: [endpoint]}).close()
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:1", "carrier-pigeon/1:2"])
-def test_a_client_whose_router_does_not_answer_says_so(endpoint: str) -> None:
+def test_clients_report_unanswering_routers(endpoint: str) -> None:
     with pytest.raises(RouterSilent, match=f"no router answers at {endpoint}"):
         ZenohBus([], [endpoint], "client")
 
 
-def test_stranger_without_certificate_of_authority_does_not_get_in(tmp_path: Path) -> None:
-    """Each side of TLS asks the other: a stranger is refused by the router, and refuses a strange router."""
+def test_strangers_without_certificate_stay_outside(tmp_path: Path) -> None:
+    """Each side of TLS asks the other: a stranger is refused by the router, and refuses a
+    strange router.
+    """
     for folder in ("ours", "theirs"):
         (tmp_path / folder).mkdir()
     ours, theirs = (encrypted("tls", tmp_path / folder) for folder in ("ours", "theirs"))
-    (endpoint,) = (place.replace("tcp", "tls") for place in find_free_endpoints(1))
+    (endpoint,) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
+    )
     router = ZenohBus([endpoint], mode="router", settings=ours.own)
     try:
-        for own in (theirs.own, None):
+        for own_file in (theirs.own, None):
             with pytest.raises(RouterSilent):
-                ZenohBus([], [endpoint], "client", own)
+                ZenohBus([], [endpoint], "client", own_file)
         ZenohBus([], [endpoint], "client", ours.own).close()
     finally:
         router.close()
@@ -90,7 +96,7 @@ ACCESS = """{
 }"""
 
 
-def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) -> None:
+def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
     users, file = tmp_path / "users.txt", tmp_path / "router.json5"
     users.write_text("lab:secret\n")
     file.write_text(ACCESS.replace("USERS", str(users)))
@@ -118,7 +124,7 @@ def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) 
             "trilat/lab/one/alive/1",
             True,
         )
-        assert until(lambda: answered(other, "trilat/lab/*/ping")) == (
+        assert until(lambda: query_once(other, "trilat/lab/*/ping")) == (
             "trilat/lab/one/ping",
             b"?",
         )
@@ -137,7 +143,7 @@ def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_messages_go_over_quic_too(tmp_path: Path) -> None:
+def test_messages_travel_over_quic(tmp_path: Path) -> None:
     network = encrypted("quic", tmp_path)
     try:
         sender, receiver = network.join(), network.join()
@@ -160,7 +166,7 @@ def routed() -> Iterator[Routed]:
 
 
 @pytest.mark.long
-def test_members_meet_again_through_a_router_that_was_started_again(routed: Routed) -> None:
+def test_members_meet_again_through_restarted_routers(routed: Routed) -> None:
     one, other = routed.join(), routed.join()
     one.announce("t/one/alive/1")
     presence, inbox, publish = (
@@ -179,11 +185,11 @@ def test_members_meet_again_through_a_router_that_was_started_again(routed: Rout
         return inbox.poll() is not None
 
     until(heard)
-    assert until(lambda: answered(other, "t/*/ping")) == ("t/one/ping", b"?")
+    assert until(lambda: query_once(other, "t/*/ping")) == ("t/one/ping", b"?")
 
 
 @pytest.mark.long
-def test_routers_that_connect_to_each_other_are_one() -> None:
+def test_connected_routers_are_one_network() -> None:
     endpoints = find_free_endpoints(2)
     routers = [
         ZenohBus(endpoints[:1], mode="router"),
@@ -198,10 +204,10 @@ def test_routers_that_connect_to_each_other_are_one() -> None:
             bus.close()
 
 
-def test_members_meet_at_a_socket_of_their_user(tmp_path: Path) -> None:
-    """A Unix socket in a folder that nobody else may enter, in place of a port of loopback."""
-    place = f"unixsock-stream/{tmp_path}/m1.sock"
-    with closing(ZenohBus([place])) as site, closing(ZenohBus([], [place])) as peer:
+def test_members_meet_at_a_private_socket(tmp_path: Path) -> None:
+    """A Unix socket in a folder that no other user may enter, in place of a port of loopback."""
+    endpoint = f"unixsock-stream/{tmp_path}/m1.sock"
+    with closing(ZenohBus([endpoint])) as site, closing(ZenohBus([], [endpoint])) as peer:
         inbox, publish = peer.inbox("trilat/x/m1/event"), site.publisher("trilat/x/m1/event")
 
         def arrived() -> bool:
@@ -209,4 +215,4 @@ def test_members_meet_at_a_socket_of_their_user(tmp_path: Path) -> None:
             return inbox.poll() is not None
 
         until(arrived)
-    assert is_loopback(place)
+    assert is_loopback(endpoint)

@@ -1,4 +1,4 @@
-"""What a person's own Zenoh configuration may say, and what it may not."""
+"""Allowed and refused settings of a person's own Zenoh configuration."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +27,7 @@ def nested(path: str, value: object) -> Any:
     return value
 
 
-def found(settings: Mapping[str, Any], path: str) -> object:
+def look_up(settings: Mapping[str, Any], path: str) -> object:
     value: Any = settings
     for key in path.split("/"):
         value = value[key]
@@ -64,7 +64,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("path", REQUIREMENTS)
-def test_a_setting_against_a_need_is_refused_with_reason(path: str) -> None:
+def test_settings_against_needs_are_refused_with_reason(path: str) -> None:
     with pytest.raises(UsageError) as refused:
         checked(nested(path, WRONG[path]))
     assert str(refused.value).startswith(f"{SOURCE}: {path}: ")
@@ -72,8 +72,8 @@ def test_a_setting_against_a_need_is_refused_with_reason(path: str) -> None:
 
 
 @given(data=st.data())
-def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject) -> None:
-    """Whatever a file states: it is refused, or the needs hold in the configuration that comes of it."""
+def test_accepted_files_keep_the_sessions_needs(data: st.DataObject) -> None:
+    """Any file is refused, or the needs hold in the resulting configuration."""
     stated: dict[str, Any] = {}
     for path in data.draw(st.lists(st.sampled_from(sorted(REQUIREMENTS)), max_size=4)):
         value = data.draw(
@@ -90,14 +90,14 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
     plain = make_zenoh_config([], [])
     for path, (holds, _) in REQUIREMENTS.items():
         try:
-            value = found(settings, path)
+            value = look_up(settings, path)
         except KeyError:
             continue  # neither stated nor set: Zenoh's default is what is needed
-        assert holds(value) or value == found(plain, path), path
+        assert holds(value) or value == look_up(plain, path), path
 
 
-def test_what_session_does_not_need_is_taken_as_it_is() -> None:
-    own = checked(
+def test_unneeded_settings_are_kept() -> None:
+    checked_file = checked(
         {
             "transport": {
                 "link": {"tx": {"lease": 9_000, "keep_alive": 3}, "protocols": ["tls"]},
@@ -108,24 +108,24 @@ def test_what_session_does_not_need_is_taken_as_it_is() -> None:
             "access_control": {"enabled": False},
         }
     ).settings
-    settings = make_zenoh_config(["tcp/a:1"], ["tcp/b:1"], "peer", own)
-    assert found(settings, "transport/link/tx/lease") == 9_000
-    assert found(settings, "transport/link/protocols") == ["tls"]
-    assert found(settings, "transport/unicast/open_timeout") == 700
-    assert found(settings, "transport/unicast/accept_timeout") == 2_000
-    assert found(settings, "transport/auth/usrpwd/password") == "p"
+    settings = make_zenoh_config(["tcp/a:1"], ["tcp/b:1"], "peer", checked_file)
+    assert look_up(settings, "transport/link/tx/lease") == 9_000
+    assert look_up(settings, "transport/link/protocols") == ["tls"]
+    assert look_up(settings, "transport/unicast/open_timeout") == 700
+    assert look_up(settings, "transport/unicast/accept_timeout") == 2_000
+    assert look_up(settings, "transport/auth/usrpwd/password") == "p"
     retry = {"period_init_ms": 100, "period_max_ms": 900, "period_increase_factor": 1.5}
-    assert found(settings, "connect/retry") == retry
-    assert found(settings, "connect/endpoints") == ["tcp/b:1"]
-    assert found(settings, "access_control/enabled") is False
+    assert look_up(settings, "connect/retry") == retry
+    assert look_up(settings, "connect/endpoints") == ["tcp/b:1"]
+    assert look_up(settings, "access_control/enabled") is False
 
 
 STOCK = Path(__file__).with_name("stock_session.json5")
 """What a machine of ROS 2 has."""
 
 
-def test_a_stock_file_is_refused_for_gossip_alone() -> None:
-    """All else that a session sets itself has the session's values there."""
+def test_stock_files_are_refused_for_gossip_only() -> None:
+    """All other settings that a session makes have the session's values there."""
     with pytest.raises(UsageError) as refused:
         read_zenoh_file(STOCK)
     assert str(refused.value).startswith(
@@ -134,7 +134,7 @@ def test_a_stock_file_is_refused_for_gossip_alone() -> None:
     assert str(refused.value).count("must be") == 1
 
 
-def test_a_stock_file_without_gossip_is_taken(tmp_path: Path) -> None:
+def test_stock_files_without_gossip_are_accepted(tmp_path: Path) -> None:
     path = tmp_path / "session.json5"
     path.write_text(
         STOCK.read_text().replace("gossip: { enabled: true }", "gossip: { enabled: false }")
@@ -144,18 +144,18 @@ def test_a_stock_file_without_gossip_is_taken(tmp_path: Path) -> None:
     settings = make_zenoh_config(
         [], file.endpoints("connect", "peer") or [], "peer", file.settings
     )
-    assert found(settings, "transport/unicast/open_timeout") == 60_000
+    assert look_up(settings, "transport/unicast/open_timeout") == 60_000
     plain = make_zenoh_config([], [])
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
-        assert found(settings, key) == found(plain, key)
+        assert look_up(settings, key) == look_up(plain, key)
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
-def test_values_that_a_session_uses_anyway_are_taken(mode: str) -> None:
+def test_values_equal_to_the_sessions_are_accepted(mode: str) -> None:
     """Once for the mode of the file, or by mode; those of another mode are refused."""
     plain = make_zenoh_config([], [], mode)  # type: ignore[arg-type]
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
-        used = found(plain, key)
+        used = look_up(plain, key)
         other = {-1: 0, 0: -1}[used] if key == "connect/timeout_ms" else not used
         assert checked({"mode": mode, **nested(key, used)}).mode == mode
         assert checked(nested(key, {mode: used})).mode == ""
@@ -168,7 +168,7 @@ def test_values_that_a_session_uses_anyway_are_taken(mode: str) -> None:
         checked(nested("listen/timeout_ms", False))
 
 
-def test_all_keys_that_contradict_a_session_are_named_at_once() -> None:
+def test_all_contradicting_keys_are_named_at_once() -> None:
     stated: dict[str, Any] = {
         "transport": {"link": {"tls": {"root_ca_certificate": "/nowhere.pem"}}}
     }
@@ -184,7 +184,7 @@ def test_all_keys_that_contradict_a_session_are_named_at_once() -> None:
     assert "access_control: must have `enabled: true`" in message
 
 
-def test_all_keys_that_zenoh_refuses_are_named_at_once(tmp_path: Path) -> None:
+def test_all_keys_refused_by_zenoh_are_named(tmp_path: Path) -> None:
     path = tmp_path / SOURCE
     path.write_text("{mod: 'peer', transport: {link: {foo: 1, tx: {lease: 'x'}}}, connect: 3}")
     with pytest.raises(UsageError) as refused:
@@ -206,7 +206,7 @@ def test_null_says_nothing() -> None:
     }
 
 
-def test_endpoints_and_mode_are_apart_and_may_depend_on_mode() -> None:
+def test_endpoints_and_mode_may_depend_on_mode() -> None:
     file = checked(
         {
             "mode": "client",
@@ -223,7 +223,7 @@ def test_endpoints_and_mode_are_apart_and_may_depend_on_mode() -> None:
     assert ZenohFile("").endpoints("listen", "peer") is None
 
 
-def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path: Path) -> None:
+def test_unreadable_certificates_are_reported_beforehand(tmp_path: Path) -> None:
     key = "transport/link/tls/root_ca_certificate"
     with pytest.raises(
         UsageError, match=rf"{SOURCE}: {key}: {tmp_path}/none.pem cannot be read: No such"
@@ -281,7 +281,7 @@ def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path
         ),
     ],
 )
-def test_a_bad_file_is_refused_with_file_and_place(
+def test_bad_files_are_refused_with_their_place(
     text: str, problem: str, tmp_path: Path
 ) -> None:
     path = tmp_path / SOURCE
@@ -297,7 +297,7 @@ def test_a_bad_file_is_refused_with_file_and_place(
     ("content", "problem"),
     [(None, "No such file"), (b"\xff\xfe{}", "is not UTF-8 text"), (b"", "has 0 objects")],
 )
-def test_a_file_that_cannot_be_read_is_named(
+def test_unreadable_files_are_named(
     content: bytes | None, problem: str, tmp_path: Path
 ) -> None:
     path = tmp_path / SOURCE
@@ -309,7 +309,7 @@ def test_a_file_that_cannot_be_read_is_named(
         read_zenoh_file(tmp_path)
 
 
-def test_json5_is_read_as_zenoh_reads_it(tmp_path: Path) -> None:
+def test_json5_is_read_as_in_zenoh(tmp_path: Path) -> None:
     path = tmp_path / SOURCE
     path.write_text(
         "\ufeff{ // comment\n 'mode': \"client\", transport: {link: {tx: {lease: 0x1f40,},},}, }\n//"
@@ -319,8 +319,8 @@ def test_json5_is_read_as_zenoh_reads_it(tmp_path: Path) -> None:
     assert file.settings == {"transport": {"link": {"tx": {"lease": 8000}}}}
 
 
-def test_zenoh_takes_what_a_session_needs_in_every_mode(tmp_path: Path) -> None:
-    """A configuration of ours is one of Zenoh's: all its keys exist there."""
+def test_zenoh_takes_the_needs_in_every_mode(tmp_path: Path) -> None:
+    """The generated configuration is a valid one of Zenoh: all its keys exist there."""
     path = tmp_path / SOURCE
     for mode in ("peer", "client", "router"):
         settings = make_zenoh_config([], [], mode)

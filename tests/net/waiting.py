@@ -1,4 +1,4 @@
-"""Waiting in tests: for a condition, at most for a time, by a clock."""
+"""Waiting in tests: for a condition, with a time limit, by a clock."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -24,7 +24,7 @@ def drained(ring: PolledRing[T]) -> list[T]:
     return list(iter(ring.poll, None))
 
 
-def answered(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] | None:
+def query_once(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] | None:
     replies = asker.query(key, payload)
     try:
         return until(replies.poll, timeout_s=0.5)

@@ -74,6 +74,6 @@ def test_each_fault_of_a_page_is_found(browser: Browser, tmp_path: Path) -> None
         assert any(words in fault for fault in faults), (body, faults)
 
 
-def test_page_without_fault_is_whole(browser: Browser, tmp_path: Path) -> None:
+def test_a_page_without_fault_is_whole(browser: Browser, tmp_path: Path) -> None:
     for name, body in WHOLE.items():
         assert find_faults(browser, body, tmp_path) == [], name

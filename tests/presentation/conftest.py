@@ -8,5 +8,5 @@ from tests.log.standard_files import made
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Logs with standard channels of every kind, by their kind."""
+    """Returns logs with standard channels of every kind, by their kind."""
     return made(tmp_path_factory.mktemp("files"))

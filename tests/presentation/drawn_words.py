@@ -1,4 +1,4 @@
-"""The words of a figure: where they are drawn, and which are cut off or lie on each other."""
+"""The words of a figure: their places, and words that are cut off or overlap."""
 
 from itertools import combinations
 
@@ -11,8 +11,10 @@ SLACK_PT = 1.0
 """By so much boxes may touch: they have room above small letters."""
 
 
-def words(figure: Figure) -> list[tuple[str, Bbox]]:
-    """Every text that is drawn and its box, pt; numbers of an axis that lie outside of it are not drawn."""
+def list_drawn_texts(figure: Figure) -> list[tuple[str, Bbox]]:
+    """Returns every text that is drawn and its box, pt; numbers of an axis that lie outside the
+    axis are not drawn.
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     renderer = canvas.get_renderer()
@@ -25,22 +27,22 @@ def words(figure: Figure) -> list[tuple[str, Bbox]]:
             for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
                 if not low - room <= scale(tick.get_loc()) <= high + room:
                     unseen |= {tick.label1, tick.label2}
-    found = []
+    texts = []
     for text in figure.findobj(Text):
         if text.get_visible() and text.get_text().strip() and text not in unseen:
             box = text.get_window_extent(renderer)
             if box.width and box.height:
-                found.append((text.get_text(), Bbox(box.get_points() * 72.0 / figure.dpi)))
-    return found
+                texts.append((text.get_text(), Bbox(box.get_points() * 72.0 / figure.dpi)))
+    return texts
 
 
 def misplaced(figure: Figure) -> list[str]:
-    """Words that are not wholly in the figure, and pairs of words that lie on each other."""
+    """Returns words that are not wholly in the figure, and pairs of words that overlap."""
     width, height = figure.get_size_inches() * 72.0
-    found = words(figure)
+    texts = list_drawn_texts(figure)
     cut_off = [
         f"{said!r} is cut off"
-        for said, box in found
+        for said, box in texts
         if box.x0 < -SLACK_PT
         or box.y0 < -SLACK_PT
         or box.x1 > width + SLACK_PT
@@ -48,7 +50,7 @@ def misplaced(figure: Figure) -> list[str]:
     ]
     on_each_other = [
         f"{one!r} lies on {other!r}"
-        for (one, a), (other, b) in combinations(found, 2)
+        for (one, a), (other, b) in combinations(texts, 2)
         if min(a.x1, b.x1) - max(a.x0, b.x0) > SLACK_PT
         and min(a.y1, b.y1) - max(a.y0, b.y0) > SLACK_PT
     ]

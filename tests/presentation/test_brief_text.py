@@ -53,7 +53,7 @@ def test_short_table_never_exceeds_ten_lines() -> None:
     assert len(table.rows) == brief_text.MOST_LINES
 
 
-def test_short_certificate_keeps_what_speaks_against_stability() -> None:
+def test_short_certificate_keeps_evidence_against_stability() -> None:
     lines = [CertificateLine("ok", "judgement")]
     lines += [CertificateLine("note", f"note {n}") for n in range(12)]
     lines += [CertificateLine("FAIL", "grows"), CertificateLine("open", "short")]
@@ -63,7 +63,7 @@ def test_short_certificate_keeps_what_speaks_against_stability() -> None:
     assert chosen[-2:] == lines[-2:]
 
 
-def test_short_certificate_is_the_beginning_of_the_long_one() -> None:
+def test_short_certificates_begin_like_long_ones() -> None:
     certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     *blocks, last = compose(certificate, brief=True)
     lines = [line.print_form.lines() for line in describe_certificate(certificate)]

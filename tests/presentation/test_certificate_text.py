@@ -1,4 +1,4 @@
-"""What the report, a terminal and a program are told of a certificate."""
+"""The text of a certificate in the report, on a terminal and in JSON."""
 
 import json
 import re
@@ -36,18 +36,18 @@ LOGS = {
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_facts_are_json_without_nan_and_say_what_verdict_says(name: str) -> None:
-    found = certify(LOGS[name]())
-    read = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert read["text"] == found.verdict.text
-    assert read["passed"] is found.passed
-    assert (read["functional"] is None) == (found.balance is None)
-    assert (read["rise"] is None) == (found.verdict.rise is None)
+def test_facts_are_json_without_nan(name: str) -> None:
+    certificate = certify(LOGS[name]())
+    read = json.loads(json.dumps(certificate.to_dict(), allow_nan=False))
+    assert read["text"] == certificate.verdict.text
+    assert read["passed"] is certificate.passed
+    assert (read["functional"] is None) == (certificate.balance is None)
+    assert (read["rise"] is None) == (certificate.verdict.rise is None)
     assert all(set(premise) == {"name", "holds", "text"} for premise in read["premises"])
 
 
 def test_the_numbers_add_up() -> None:
-    """V at the end is V at the start, less what was taken, plus what was given, to the residual."""
+    """V at the end is V at the start, less the dissipation, plus the work, to the residual."""
     f = certify(LOGS["jitter"]()).to_dict()["functional"]
     end = f["v_first_j"] - sum(f["taken_j"].values()) + sum(f["given_j"].values())
     assert end == pytest.approx(f["v_last_j"], abs=f["residual_max_j"])
@@ -55,20 +55,20 @@ def test_the_numbers_add_up() -> None:
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_a_figure_is_a_function_of_the_log(name: str) -> None:
+def test_figures_are_a_function_of_the_log(name: str) -> None:
     log = LOGS[name]()
-    found = certify(log)
-    figure = draw_functional(log, found)
-    if found.balance is None:
-        assert [text.get_text() for text in figure.texts] == [found.verdict.text]
+    certificate = certify(log)
+    figure = draw_functional(log, certificate)
+    if certificate.balance is None:
+        assert [text.get_text() for text in figure.texts] == [certificate.verdict.text]
         return
     assert [axes.get_ylabel()[-3:] for axes in figure.axes] == ["(J)"] * 4
     assert figure.axes[-1].get_xlabel() == "time (s)"
     assert figure.axes[-1].get_yscale() == "log"
     total = figure.axes[0].lines[0]
-    assert np.max(total.get_ydata()) == pytest.approx(found.balance.V.max())
+    assert np.max(total.get_ydata()) == pytest.approx(certificate.balance.V.max())
     marked = [p for p in figure.axes[0].patches if p.get_zorder() == 0.4]
-    assert len(marked) == (found.verdict.rise is not None)
+    assert len(marked) == (certificate.verdict.rise is not None)
 
 
 @pytest.mark.parametrize(
@@ -81,29 +81,29 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
         ("diverged", "FAIL ok ok ok"),
     ],
 )
-def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
-    name: str, marks: str
-) -> None:
-    found = certify(LOGS[name]())
-    said = describe_certificate(found)
-    assert [line.mark for line in said] == marks.split()
-    assert said[0].text.startswith(f"{found.stability}: {found.end.behaviour}")
-    of_v = [] if name == "p_d" else [found.verdict.text]  # the law P+d has no V
-    texts = [line.text for line in said]
-    of_end = [] if name == "diverged" else [f"e and qd: {found.end.text}"]
+def test_lines_give_judgement_verdict_end_and_balance(name: str, marks: str) -> None:
+    certificate = certify(LOGS[name]())
+    text = describe_certificate(certificate)
+    assert [line.mark for line in text] == marks.split()
+    assert text[0].text.startswith(f"{certificate.stability}: {certificate.end.behaviour}")
+    of_v = [] if name == "p_d" else [certificate.verdict.text]  # the law P+d has no V
+    texts = [line.text for line in text]
+    of_end = [] if name == "diverged" else [f"e and qd: {certificate.end.text}"]
     assert texts[1 : 1 + len(of_v + of_end)] == of_v + of_end
 
 
 @pytest.mark.parametrize("behaviour", EndBehaviour)
 @pytest.mark.parametrize("name", LOGS)
 @pytest.mark.parametrize("root_per_s", [-0.25, 0.25])
-def test_the_first_line_repeats_no_word_and_agrees_with_its_judgement(
+def test_the_first_line_agrees_with_its_judgement(
     name: str, behaviour: EndBehaviour, root_per_s: float
 ) -> None:
-    found = certify(LOGS[name]())
+    certificate = certify(LOGS[name]())
     word = "stable" if root_per_s < 0.0 else "unstable"
     roots = LoopRoots(word, root_per_s, True, f"this rest: {word}, {root_per_s} /s")
-    judged = replace(found, end=found.end._replace(behaviour=behaviour), roots=roots)
+    judged = replace(
+        certificate, end=certificate.end._replace(behaviour=behaviour), roots=roots
+    )
     lines = describe_certificate(judged)
     (first,) = lines[0].print_form.lines()
     assert not re.search(r"\b(\w+)\W+\1\b", first)
@@ -115,14 +115,14 @@ def test_the_first_line_repeats_no_word_and_agrees_with_its_judgement(
         assert "FAIL" in [line.mark for line in lines[1:]]
 
 
-def test_divergence_is_said_once_with_its_joint() -> None:
+def test_divergence_is_stated_once_with_its_joint() -> None:
     log = logs.diverged()
-    found = certify(log)
+    certificate = certify(log)
     cause = log.describe_divergence()
     assert re.fullmatch(
         r"(m1|m2|s) joint [12] reached 0\.\d+ rad/s \(limit 0\.5 rad/s\) at \S+ s", cause
     )
-    texts = [line.text for line in describe_certificate(found)]
+    texts = [line.text for line in describe_certificate(certificate)]
     assert texts[0] == f"not stable: diverged: {cause}"
     assert not [text for text in texts[1:] if "diverged at" in text or cause in text]
     site = cause.split()[0]
@@ -131,13 +131,13 @@ def test_divergence_is_said_once_with_its_joint() -> None:
 
 
 def test_sentences_about_a_record_fit_its_length() -> None:
-    """This run diverged after milliseconds: there is neither a last second nor a push to follow."""
+    """This run diverged after milliseconds, so that there is neither a last second nor a push to follow."""
     short = {"duration_s": 2.0, "rate_hz": 1000, "limits.qd_limit_rad_s": 0.02}
     log = runs.run("free", short).log
-    found = certify_run(log)
-    assert found.twins is not None
-    assert found.twins.text == "twins: too short a record to follow a push"
-    texts = [line.text for line in describe_certificate(found)]
+    certificate = certify_run(log)
+    assert certificate.twins is not None
+    assert certificate.twins.text == "twins: too short a record to follow a push"
+    texts = [line.text for line in describe_certificate(certificate)]
     assert not [text for text in texts if "last second" in text]
     brief = runs.run("free", {"duration_s": 0.5, "rate_hz": 200}).certificate
     assert brief.end.text.endswith("in the whole record")
@@ -146,11 +146,11 @@ def test_sentences_about_a_record_fit_its_length() -> None:
     )
 
 
-def test_a_short_run_says_so_once_and_for_how_long() -> None:
+def test_short_runs_state_their_length_once() -> None:
     slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
-    found = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
-    end = found.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
-    short = replace(found, end=end, roots=slow)
+    certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
+    end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
+    short = replace(certificate, end=end, roots=slow)
     needed_s = 8.0 * np.log(2.0) / 0.25 + end.quiet_from_s
     assert describe_judgement(short) == (
         f"open: the run is too short to tell; a run of {needed_s:.3g} s would"
@@ -160,12 +160,12 @@ def test_a_short_run_says_so_once_and_for_how_long() -> None:
     assert end.text not in describe_judgement(long)  # the line of the end has it
 
 
-def test_pace_is_that_of_the_slowest_root() -> None:
-    found = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
+def test_pace_follows_the_slowest_root() -> None:
+    certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     for rate_per_s, verb in ((-0.5, "halves"), (0.5, "doubles")):
         verdict = "stable" if rate_per_s < 0.0 else "unstable"
         roots = LoopRoots(verdict, rate_per_s, True, f"this rest: {verdict}")
-        judged = replace(found, roots=roots)
+        judged = replace(certificate, roots=roots)
         assert describe_pace(judged) == f"a small disturbance {verb} every 1.4 s"
         assert describe_pace(replace(judged, roots=roots._replace(exact=False))) == ""
 
@@ -178,10 +178,10 @@ def test_many_links_are_one_entry() -> None:
     assert [name for name in names if "->" in name or "links" in name] == ["supplied: 19 links"]
 
 
-def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
-    told = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
-    assert told.mark == "note"
-    assert told.text.startswith(
+def test_wrong_weights_of_the_paper_are_named() -> None:
+    last_line = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
+    assert last_line.mark == "note"
+    assert last_line.text.startswith(
         "with the paper's weights, ones, V would have risen by 12.3 J of 32.8"
     )
     assert (
@@ -190,18 +190,18 @@ def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
 
 
 @pytest.mark.parametrize("name", ["jitter", "rich", "busy"])
-def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
-    found = certify(LOGS[name]())
-    assert found.balance is not None
-    (_, first), *between, (_, last) = list_energies(found.balance)
+def test_listed_energies_sum_to_v(name: str) -> None:
+    certificate = certify(LOGS[name]())
+    assert certificate.balance is not None
+    (_, first), *between, (_, last) = list_energies(certificate.balance)
     assert first + sum(amount for _, amount in between) == pytest.approx(
-        last, abs=1e-5 * found.balance.scale
+        last, abs=1e-5 * certificate.balance.scale
     )
 
 
-def test_no_energy_is_said() -> None:
+def test_missing_energies_are_reported() -> None:
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 0.5, "rate_hz": 200}
-    found = certify(runs.run("paper", rest).log)
+    certificate = certify(runs.run("paper", rest).log)
     assert "energy balance: there is no energy in this run" in [
-        line.text for line in describe_certificate(found)
+        line.text for line in describe_certificate(certificate)
     ]

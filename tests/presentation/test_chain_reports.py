@@ -1,4 +1,4 @@
-"""Reports of arms of six joints: where pictures put the joints, names and units, panels and the page."""
+"""Reports of arms of six joints: positions of joints in pictures, names and units, panels and the page."""
 
 import json
 import re
@@ -30,7 +30,7 @@ def six() -> Log:
     return simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200}))
 
 
-def test_the_end_of_a_chain_is_where_pinocchio_has_it():
+def test_chains_end_where_pinocchio_says():
     arm = six().scenario.arms["m1"]
     states = chain_references()["arm6"].states
     points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
@@ -42,7 +42,7 @@ def test_the_end_of_a_chain_is_where_pinocchio_has_it():
     assert not points[:, 0].any()
 
 
-def test_pictures_of_chain_have_up_on_top_and_shadows_below():
+def test_pictures_of_chains_have_shadows_below():
     arm = six().scenario.arms["m1"]
     origin, above, aside = arm_poses.project_arm_m(
         arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]])
@@ -84,14 +84,14 @@ def test_every_joint_has_its_panel(form, draw, panels):
     figure = draw(six(), form)
     assert panels in (None, len(figure.axes))
     assert misplaced(figure) == []
-    words = " ".join(
+    text = " ".join(
         axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes
     )
     if panels in (6, 7):
-        assert all(f"{n}: {name}" in words for n, name in enumerate(JOINTS, 1))
+        assert all(f"{n}: {name}" in text for n, name in enumerate(JOINTS, 1))
 
 
-def test_paths_are_those_of_the_end_effectors_in_three_planes():
+def test_tip_paths_appear_in_three_planes():
     log = six()
     panels = joint_motion.draw_end_effector_paths(log, REPORT_SIZE).axes
     names = [(axes.get_xlabel()[0], axes.get_ylabel()[0]) for axes in panels]
@@ -104,8 +104,10 @@ def test_paths_are_those_of_the_end_effectors_in_three_planes():
             assert path[[0, -1]] == pytest.approx(points[:, plane], abs=1e-12)
 
 
-def test_the_force_of_a_wall_is_the_recorded_torque():
-    """Its torque is the force times what the end effector moves along the normal, by differences of poses."""
+def test_wall_forces_equal_the_recorded_torques():
+    """The wall's torque is the force times the end effector's motion along the normal, by
+    differences of poses.
+    """
     arm = six().scenario.arms["s"]
     start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[
         0, -1
@@ -153,7 +155,7 @@ def test_columns_and_messages_name_joints_and_links():
     ("scenario", "side"),
     [("two_people", charts.PICTURE_SIDE), ("paper", None)],
 )
-def test_lines_of_small_planar_arms_are_as_thin_as_those_of_large_ones(scenario, side):
+def test_small_planar_arms_have_lines_as_thin(scenario, side):
     log = tn.simulate(scenario, duration_s=0.5)
     builder = charts.ChartBuilder(log, None)
     data = builder.build().data.to_builtins()

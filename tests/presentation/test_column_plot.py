@@ -1,4 +1,4 @@
-"""`log.plot`: which columns, sites, joints and times a figure shows, and what a wrong name says."""
+"""`log.plot`: the columns, sites, joints and times of a figure, and the error for a wrong name."""
 
 import subprocess
 import sys
@@ -23,7 +23,7 @@ def curves(axes):
     return [line for line in axes.lines if line.get_transform() == axes.transData]
 
 
-def test_without_arguments_it_is_the_overview():
+def test_the_default_is_the_overview():
     log = logs.simulated("four")
     assert titles(log.plot()) == titles(tn.figure(log, "overview", width_in=7.0))
 
@@ -88,10 +88,10 @@ def test_sites_joints_and_times_restrict_a_figure():
 def test_modes_are_steps_between_words():
     log = logs.busy().log
     [axes] = log.plot("mode").axes
-    words = [label.get_text() for label in axes.get_yticklabels()]
+    labels = [label.get_text() for label in axes.get_yticklabels()]
     recorded = {mode for site in log.sites for mode in log[site].mode}
-    assert set(words) == recorded
-    assert words[0] == "run"
+    assert set(labels) == recorded
+    assert labels[0] == "run"
     assert {line.get_drawstyle() for line in curves(axes)} == {"steps-post"}
 
 
@@ -131,14 +131,14 @@ def test_sites_with_poses_have_errors_along_axes():
         (["q"], {"from_s": float("nan")}, UsageError, "less than until_s"),
     ],
 )
-def test_a_wrong_name_says_what_would_be_right(names, selection, error, hint):
+def test_wrong_names_suggest_the_right_ones(names, selection, error, hint):
     with pytest.raises(error) as refused:
         logs.simulated("four").plot(*names, **selection)
     assert hint in str(refused.value)
 
 
 @pytest.mark.long
-def test_without_matplotlib_it_says_what_to_install():
+def test_without_matplotlib_its_installation_is_named():
     script = """
 import sys
 sys.modules["matplotlib"] = None

@@ -1,7 +1,9 @@
-"""Orientations leave the program without a jump: every export, topic and page, against SciPy's rotations.
+"""Orientations leave the program without a jump: every export, topic and page, against SciPy's
+rotations.
 
-A motion may pass half a turn about any axis, and turn several times. The records then have rotation vectors
-that jump; whatever a user reads moves at most `ALLOWED` times as far as the arm from one row to the next.
+A motion may pass half a turn about any axis, and turn several times. The records then have
+rotation vectors that jump. In every output the values move at most `ALLOWED` times as far as
+the arm from one row to the next.
 """
 
 import json
@@ -54,7 +56,7 @@ Series = tuple[str, Array, Rotation]
 
 
 def read_rotation(series: Array) -> Rotation:
-    """The orientations of quaternions or of the first two columns of matrices."""
+    """Returns the orientations of quaternions or of the first two columns of matrices."""
     if series.shape[1] == 4:
         return Rotation.from_quat(series, scalar_first=True)
     columns = series[:, :3], series[:, 3:], np.cross(series[:, :3], series[:, 3:])
@@ -62,14 +64,16 @@ def read_rotation(series: Array) -> Rotation:
 
 
 def assert_follows(what: str, series: Array, truth: Rotation, accuracy: float = 1e-6) -> None:
-    """The series has the orientations, and no step larger than `ALLOWED` times that of the motion."""
+    """Asserts that the series has the orientations, and no step larger than `ALLOWED` times
+    that of the motion.
+    """
     assert (read_rotation(series) * truth.inv()).magnitude().max() < accuracy, what
     largest = np.linalg.norm(np.diff(series, axis=0), axis=1).max()
     assert largest <= ALLOWED * largest_step(truth), what
 
 
 def test_motions_pass_half_a_turn() -> None:
-    """Without that the other tests would show nothing."""
+    """Otherwise the other tests would prove nothing."""
     wraps = [count_wraps(turn(number)) for number in MOTIONS]
     assert sum(count > 0 for count in wraps) >= 25
     assert max(wraps) >= 3
@@ -96,7 +100,7 @@ def test_numbers_of_a_turning_body_never_jump(number: int) -> None:
 def list_table_series(
     read: Callable[[str, str], Any], motions: dict[str, Motion], records: int = RECORDS
 ) -> Iterator[Series]:
-    """The orientations in a table of states; `read` returns a column of a site."""
+    """Yields the orientations in a table of states; `read` returns a column of a site."""
     for site, motion in motions.items():
         for field, truth in (("x", motion.turned), ("q_des", motion.reference)):
             columns = [
@@ -161,8 +165,8 @@ def list_lerobot(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator
         yield column, frames[column].to_numpy()[:, 3:].astype(np.float64), motions["m"].turned
 
 
-def read_turn(found: Any) -> list[float]:
-    return [found.w, found.x, found.y, found.z]
+def read_turn(quantity: Any) -> list[float]:
+    return [quantity.w, quantity.x, quantity.y, quantity.z]
 
 
 def list_ros_series(
@@ -172,17 +176,17 @@ def list_ros_series(
     motions: dict[str, Motion],
     prefix: str,
 ) -> Iterator[Series]:
-    """The orientations in messages of poses, by topic, and of frames."""
+    """Yields the orientations in messages of poses, by topic, and of frames."""
     for site, motion in motions.items():
         for topic, truth in (("tip_pose", motion.turned), ("reference_pose", motion.reference)):
             messages = poses[f"{prefix}/{site}/{topic}"]
-            turns = np.array([read_turn(one.pose.orientation) for one in messages])
+            turns = np.array([read_turn(transform.pose.orientation) for transform in messages])
             yield f"{site} {topic}", turns, truth
     links = defaultdict(list)
     for message in frames:
-        for one in message.transforms:
-            links[one.header.frame_id, one.child_frame_id].append(
-                read_turn(one.transform.rotation)
+        for transform in message.transforms:
+            links[transform.header.frame_id, transform.child_frame_id].append(
+                read_turn(transform.transform.rotation)
             )
     for site, motion in motions.items():
         turned = [Rotation.identity(RECORDS), *place_links(log.scenario, site, motion.q)]
@@ -209,14 +213,14 @@ def list_bag(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Ser
 
 
 class Topic(list[bytes]):
-    """A topic to which somebody listens."""
+    """A topic with a subscriber."""
 
     has_subscribers = True
     put = list.append
 
 
 class Graph:
-    """A graph of ROS that keeps what is published."""
+    """A graph of ROS that keeps the published messages."""
 
     def __init__(self) -> None:
         self.published: dict[str, Topic] = defaultdict(Topic)
@@ -229,9 +233,9 @@ def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Ite
     graph = Graph()
     ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
     for site in motions:
-        shown = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
+        site_topics = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
         for record in log[site].states:
-            shown.publish(record, 1000.0)
+            site_topics.publish(record, 1000.0)
     kind = "geometry_msgs/msg/PoseStamped"
     poses = {
         topic: [ROS.deserialize_cdr(data, kind) for data in messages]
@@ -258,7 +262,7 @@ def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Ite
     ],
 )
 @pytest.mark.parametrize("number", EVERY)
-def test_every_export_and_topic_turns_as_the_arm_does(
+def test_exports_and_topics_turn_with_the_arm(
     tmp_path: Path, number: int, list_series: Callable[..., Iterator[Series]]
 ) -> None:
     log, motions = make_log(number)
@@ -271,11 +275,11 @@ def test_every_export_and_topic_turns_as_the_arm_does(
 
 
 @pytest.mark.parametrize("number", MOTIONS)
-def test_bodies_on_the_page_turn_as_the_plant_says(number: int) -> None:
+def test_bodies_on_pages_turn_with_the_plant(number: int) -> None:
     """A plant may give its quaternions any sign."""
     truth, bodies = turn(number), BodyTurns()
     canonical = truth.as_quat(canonical=True, scalar_first=True)
-    frames = [bodies.align([1.0, 2.0, 3.0, *one, 0.0, 0.0, 0.0, *-one]) for one in canonical]
+    frames = [bodies.align([1.0, 2.0, 3.0, *axis, 0.0, 0.0, 0.0, *-axis]) for axis in canonical]
     poses = np.array(frames).reshape(RECORDS, 2, 7)
     assert_follows("first body", poses[:, 0, 3:], truth, 1e-4)
     assert_follows("second body", poses[:, 1, 3:], truth, 1e-4)
@@ -283,7 +287,7 @@ def test_bodies_on_the_page_turn_as_the_plant_says(number: int) -> None:
     assert BodyTurns().align([]).tolist() == []
 
 
-def test_an_environment_observes_orientations_that_never_jump() -> None:
+def test_environments_observe_continuous_orientations() -> None:
     """Arms whose tools point down, as the user and as its peer."""
     env = tn.make_env(
         CASE.read_text(encoding="utf-8"), user="s", leads="m", rate_hz=100, duration_s=2.0
@@ -298,14 +302,14 @@ def test_an_environment_observes_orientations_that_never_jump() -> None:
     assert env.observation_space.contains(observed[-1])
     for what, column in (("q_des", 3), ("peer_q", 9)):
         vectors = np.array(shared)[:, column : column + 3]
-        series = np.array([one[what].ravel()[3:] for one in observed[1:]])
+        series = np.array([observation[what].ravel()[3:] for observation in observed[1:]])
         assert series.shape[1] == 6
         turned = Rotation.from_rotvec(vectors)
         assert count_wraps(turned) > 0
         assert_follows(what, series, turned)
 
 
-def test_a_dataset_of_a_tool_that_points_down_has_no_jump(tmp_path: Path) -> None:
+def test_datasets_of_downward_tools_have_no_jump(tmp_path: Path) -> None:
     log = tn.simulate(str(CASE))
     tn.export(log, "lerobot", tmp_path / "out")
     frames = pl.read_parquet(tmp_path / "out" / "data" / "chunk-000" / "file-000.parquet")

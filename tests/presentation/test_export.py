@@ -1,4 +1,4 @@
-"""What other programs read of an export is the log, bit for bit."""
+"""Exports contain the log bit for bit, as other programs read them."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ from trilat_net.scenario import parse_scenario
 
 @cache
 def log() -> Log:
-    """A log with everything in it: links of all kinds, modes, changes, events, statistics."""
+    """Returns a log with all features: links of all kinds, modes, changes, events, statistics."""
     text = 'says "no",\nand 1.5 °C'
     awkward = Event(
         member="a", boot=2**64 - 1, kind="refused", text=text, t_ns=-1, clocks={"a": "x"}, n=0
@@ -35,15 +35,15 @@ def log() -> Log:
     )
     stats = opened(recorded("two_sites", {"duration_s": 0.4})).link_stats("m")
     new = {"site": "a", "dropped": {"not finite": 3}, "offset_us": {"b": -4}}
-    told = [msgspec.structs.replace(one, **new) for one in stats]
+    statistics_list = [msgspec.structs.replace(statistics, **new) for statistics in stats]
     return logs.rewritten(
-        logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *told]
+        logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *statistics_list]
     )
 
 
 @cache
 def expected() -> dict[str, dict[str, list[Any]]]:
-    """Per table the values of every column, as Python's own; None where there is none."""
+    """Returns the values of every column per table, as Python's own; None without a value."""
     wanted = {
         table.label: {column.name: column.rows(0, len(table)) for column in table.columns}
         for table in log().tables()
@@ -68,7 +68,7 @@ def bits(value: float) -> bytes:
 
 
 def same(value: Any, wanted: Any) -> bool:
-    """Equal as numbers, and a float bit for bit."""
+    """True if two values are equal as numbers, and floats bit for bit."""
     if isinstance(wanted, float):
         return isinstance(value, float) and bits(value) == bits(wanted)
     return type(value) is type(wanted) and value == wanted
@@ -80,9 +80,9 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
         with (folder / f"{name}.csv").open(encoding="utf-8", newline="") as stream:
             heads, *rows = csv.reader(stream)
         assert heads == list(columns)
-        for place, values in enumerate(columns.values()):
+        for column_index, values in enumerate(columns.values()):
             for row, wanted in zip(rows, values, strict=True):
-                text = row[place]
+                text = row[column_index]
                 read = (
                     text
                     if isinstance(wanted, str)
@@ -108,19 +108,19 @@ def test_parquet_read_by_polars(tmp_path: Path) -> None:
 
 def test_npz_read_by_numpy(tmp_path: Path) -> None:
     arrays = np.load(exported("npz", tmp_path))  # which refuses pickles
-    found = set()
+    seen_columns = set()
     for name, columns in expected().items():
         site, _, kind = name.partition("_")
-        place = site if kind in ("", "state") else f"{site}/{kind}"
+        table_name = site if kind in ("", "state") else f"{site}/{kind}"
         for column, values in columns.items():
-            found.add(f"{place}/{column}")
-            read = arrays[f"{place}/{column}"].tolist()
+            seen_columns.add(f"{table_name}/{column}")
+            read = arrays[f"{table_name}/{column}"].tolist()
             for value, wanted in zip(read, values, strict=True):
                 if None in values:  # NaN needs a float
                     assert np.isnan(value) if wanted is None else value == wanted
                 else:
                     assert same(value, wanted)
-    assert set(arrays) == found | {"about_json", "scenario_toml"}
+    assert set(arrays) == seen_columns | {"about_json", "scenario_toml"}
     assert parse_scenario(str(arrays["scenario_toml"])) == log().scenario
     assert json.loads(str(arrays["about_json"]))["session"] == log().session
 
@@ -155,7 +155,7 @@ def test_mat_read_by_scipy(tmp_path: Path) -> None:
             assert (units if isinstance(units, str) else "") == said["unit"]
 
 
-def test_stamps_of_a_live_log_are_exact_in_matlab(tmp_path: Path) -> None:
+def test_live_stamps_are_exact_in_matlab(tmp_path: Path) -> None:
     """1.7e18 ns are no exact double."""
     sites = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)
     assert sites["a"]["publish_time_ns"].dtype == np.int64
@@ -165,7 +165,7 @@ def test_stamps_of_a_live_log_are_exact_in_matlab(tmp_path: Path) -> None:
 
 def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
     path, wanted = exported("ros2", tmp_path), expected()
-    found: dict[str, list[list[float]]] = {}
+    columns: dict[str, list[list[float]]] = {}
     with path.open("rb") as stream:
         for _, channel, message, decoded in make_reader(
             stream, decoder_factories=[DecoderFactory()]
@@ -173,7 +173,7 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
             topics=[f"/{log().session['session']}/{site}/joint_states" for site in "abc"]
         ):
             row = [*decoded.position, *decoded.velocity, *decoded.effort, message.publish_time]
-            found.setdefault(channel.topic.split("/")[2], []).append(row)
+            columns.setdefault(channel.topic.split("/")[2], []).append(row)
     names = (
         "q1_rad",
         "q2_rad",
@@ -185,11 +185,11 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
     )
     for site in "abc":
         rows = zip(*(wanted[f"{site}_state"][name] for name in names), strict=True)
-        assert found[site] == [list(row) for row in rows]
+        assert columns[site] == [list(row) for row in rows]
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
-def test_a_folder_says_what_is_in_it(form: str, tmp_path: Path) -> None:
+def test_a_folder_describes_its_files(form: str, tmp_path: Path) -> None:
     folder = exported(form, tmp_path)
     about = json.loads((folder / "about.json").read_text())
     assert set(about["tables"]) == {path.name for path in folder.iterdir()} - {
@@ -209,8 +209,8 @@ def test_a_folder_says_what_is_in_it(form: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["ros2", "csv", "parquet", "npz", "mat"])
-def test_an_export_has_no_stamp_of_its_own(form: str, tmp_path: Path) -> None:
-    """The same log gives the same bytes, but where a format stamps its file."""
+def test_exports_have_no_stamp_of_their_own(form: str, tmp_path: Path) -> None:
+    """The same log gives the same bytes, except in formats that stamp their files."""
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         exported(form, tmp_path / name)

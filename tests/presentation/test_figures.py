@@ -1,4 +1,7 @@
-"""Figures of a log: what they show, per figure and per marker. Their size and type: test_registry."""
+"""Figures of a log: their content, per figure and per marker.
+
+Sizes and types are tested in test_registry.
+"""
 
 from types import SimpleNamespace
 
@@ -30,7 +33,7 @@ BACKGROUND = 0.6
 
 
 def marked(figure):
-    """What is drawn behind the lines of all panels: shades, and lines where something was changed."""
+    """Returns the marks behind the lines of all panels: shades, and lines at changes."""
     shades = [p for axes in figure.axes for p in axes.patches if p.get_zorder() < BACKGROUND]
     changes = [
         line for axes in figure.axes for line in axes.lines if line.get_zorder() == BACKGROUND
@@ -39,7 +42,7 @@ def marked(figure):
 
 
 def lines(axes):
-    """Lines over time, without the horizontal ones that span the panel."""
+    """Returns lines over time, without the horizontal ones that span the panel."""
     return [line for line in axes.lines if line.get_transform() == axes.transData]
 
 
@@ -107,7 +110,7 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
     assert "and 2 more" in joint_motion.draw_operation(log).get_supxlabel()
 
 
-def test_the_stated_mean_is_drawn_only_while_it_holds():
+def test_the_stated_mean_is_drawn_while_valid():
     log = logs.busy().log
     figure = age_and_lateness.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
@@ -124,7 +127,7 @@ def test_the_stated_mean_is_drawn_only_while_it_holds():
     ]
 
 
-def test_estimates_have_a_line_per_site_and_the_truth():
+def test_each_site_has_estimates_beside_the_truth():
     figure = joint_motion.draw_parameter_estimates(logs.simulated("paper"))
     assert [len(lines(axes)) for axes in figure.axes] == [3] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
@@ -132,7 +135,7 @@ def test_estimates_have_a_line_per_site_and_the_truth():
     assert [line.get_ydata()[0] for line in truths] == [2.0]
 
 
-def test_distributions_reach_longest_age_and_rare_one_by_logarithm():
+def test_distributions_show_rare_long_ages():
     for few, even in ((20.0, True), (1.0, False)):
         ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
         x_ms = age_and_lateness.choose_delay_axis_ms(
@@ -142,7 +145,7 @@ def test_distributions_reach_longest_age_and_rare_one_by_logarithm():
         assert (x_ms[0] == 0.0) == even
 
 
-def test_ages_that_go_up_and_down_all_time_are_band():
+def test_ages_that_alternate_are_a_band():
     seconds, swings = np.arange(4000) / 1000.0, np.arange(4000) % 5
     assert age_and_lateness.is_unsteady(200.0 + 10.0 * swings)
     assert not age_and_lateness.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
@@ -153,21 +156,21 @@ def test_ages_that_go_up_and_down_all_time_are_band():
     assert set(median.get_ydata()) == {220.0}
 
 
-def test_slave_has_same_colour_however_many_masters_there_are():
+def test_slave_colours_are_independent_of_masters():
     for name, slaves in (("two_sites", 1), ("paper", 2), ("training", 2)):
         colours = list_site_colours(load_scenario(name))
         assert len(set(colours)) == len(SITE_COLOURS)
         assert colours[slaves] == SITE_COLOURS[2]
 
 
-def test_the_axis_of_ages_is_logarithmic_after_an_outage():
+def test_ages_after_an_outage_are_logarithmic():
     for outage_ms in (0.0, 5000.0):
         values = np.append(np.full(1000, 200.0), 200.0 + outage_ms)
         assert age_and_lateness.needs_log_axis(values) == (outage_ms > 0.0)
     assert not age_and_lateness.needs_log_axis(np.full(3, np.nan))
 
 
-def test_shares_are_of_all_that_there_is():
+def test_shares_are_fractions_of_the_total():
     percent = age_and_lateness.compute_cumulative_percent(
         np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])
     )
@@ -175,7 +178,7 @@ def test_shares_are_of_all_that_there_is():
     assert np.isnan(age_and_lateness.compute_cumulative_percent(np.zeros(0), np.zeros(2))).all()
 
 
-def test_arms_stand_at_their_angles_in_panels_with_equal_axes():
+def test_arms_stand_in_panels_with_equal_axes():
     log = logs.simulated("four")
     arm = log.scenario.arms["c"]
     base, elbow, end_effector = arm_poses.joint_positions_m(
@@ -196,7 +199,7 @@ def test_arms_stand_at_their_angles_in_panels_with_equal_axes():
     assert 3 <= len(instants) <= arm_poses.INSTANTS
 
 
-def test_path_is_thinned_by_its_length_and_keeps_its_ends():
+def test_long_paths_are_thinned_between_ends():
     turns = np.linspace(0.0, 6.0, 20_001) ** 3  # ever faster
     circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     kept = joint_motion.thin_path(circle)
@@ -219,7 +222,7 @@ def test_a_triangle_stands_where_a_site_settles():
     assert all(float(y) == site_signals.SETTLED_ERROR_RAD for _, (y,) in marks)
 
 
-def test_a_phase_portrait_is_of_e_and_its_rate():
+def test_phase_portraits_show_e_and_its_rate():
     log = logs.simulated("paper")
     line = joint_motion.draw_phase_portrait(log).axes[1].lines[0]
     part = log["m1"]
@@ -229,16 +232,19 @@ def test_a_phase_portrait_is_of_e_and_its_rate():
     }
 
 
-def test_limit_of_torque_is_drawn_where_it_was_reached():
+def test_torque_limits_are_drawn_where_reached():
     free = joint_motion.draw_control_torques(logs.simulated("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
-    held = trilat_net.simulate(
+    log = trilat_net.simulate(
         "paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20}
     )
-    figure = joint_motion.draw_control_torques(held)
+    figure = joint_motion.draw_control_torques(log)
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
     axes = figure.axes[0]
-    assert {one.get_ydata()[0] for one in axes.lines if one not in lines(axes)} == {20.0, -20.0}
+    assert {line.get_ydata()[0] for line in axes.lines if line not in lines(axes)} == {
+        20.0,
+        -20.0,
+    }
 
 
 RAMPS = [
@@ -261,14 +267,14 @@ def test_shares_are_drawn_as_they_change():
     assert joint_motion.list_sites_with_changing_dominance(logs.simulated("paper")) == []
 
 
-def test_overview_has_extremes_of_every_site_and_verdict():
+def test_overview_has_all_extremes_and_the_verdict():
     log = logs.simulated("paper")
-    made = run_overview.draw_overview(log)
-    errors, _, torques, _ = made.axes
+    overview = run_overview.draw_overview(log)
+    errors, _, torques, _ = overview.axes
     for site, error, torque in zip(log.sites, lines(errors), lines(torques), strict=False):
         assert np.nanmax(error.get_ydata()) == np.abs(log[site].e).max()
         assert np.nanmax(torque.get_ydata()) == np.abs(log[site].tau).max()
-    assert str(trilat_net.certify(log).stability) in made.legends[0].get_title().get_text()
+    assert str(trilat_net.certify(log).stability) in overview.legends[0].get_title().get_text()
 
 
 def test_overlaid_runs_share_sites_and_kind():
@@ -276,17 +282,17 @@ def test_overlaid_runs_share_sites_and_kind():
         logs.simulated("paper"),
         trilat_net.simulate(parse_scenario(planar_task(0.02))),
     )
-    made = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
-    one, _ = lines(made.axes[2])
+    overlay = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
+    one, _ = lines(overlay.axes[2])
     assert np.nanmax(one.get_ydata()) == max(
         np.abs(paper[site].tau).max() for site in paper.sites
     )
-    assert [text.get_text() for text in made.legends[0].get_texts()] == ["one", "two"]
+    assert [text.get_text() for text in overlay.legends[0].get_texts()] == ["one", "two"]
     with pytest.raises(UsageError, match="in the same unit"):
         run_overview.draw_overlay({"a": paper, "b": task})
 
 
-def test_a_figure_shows_itself_in_a_notebook() -> None:
+def test_figures_show_themselves_in_a_notebook() -> None:
     log = trilat_net.simulate("two_sites", duration_s=0.1)
     drawn = trilat_net.figure(log)
     assert drawn._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
@@ -295,7 +301,7 @@ def test_a_figure_shows_itself_in_a_notebook() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["two_sites", "six_joints", "wall_in_space"])
-def test_a_site_shows_itself_in_a_notebook(scenario: str) -> None:
+def test_sites_show_themselves_in_a_notebook(scenario: str) -> None:
     log = trilat_net.simulate(scenario, duration_s=0.1)
     for site in log.values():
         html = site._repr_html_()

@@ -1,4 +1,4 @@
-"""A report as its reader first sees it: on a desktop and on a phone, by day and by night."""
+"""The first screen of a report: on a desktop and on a phone, by day and by night."""
 
 from pathlib import Path
 from typing import Any

@@ -23,14 +23,14 @@ LIVE_ONLY = {"link_delay", "link_offset", "timing"}
 
 def first_messages(file: Path) -> dict[str, object]:
     """Returns the first message of each topic that the schemas of the file can decode."""
-    found: dict[str, object] = {}
+    messages: dict[str, object] = {}
     with file.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
         topics = [c.topic for c in summary.channels.values() if c.message_encoding == "cdr"]
         for _, channel, _, message in reader.iter_decoded_messages(topics):
-            found.setdefault(channel.topic, message)
-    return found
+            messages.setdefault(channel.topic, message)
+    return messages
 
 
 def resolve(path: str, messages: Mapping[str, object]) -> object:
@@ -72,7 +72,7 @@ def paper(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return log.save(folder / "run.mcap"), tn.export(log, "ros2", folder / "bag.mcap")
 
 
-def test_every_path_of_the_paper_leads_to_a_number(paper: tuple[Path, Path]) -> None:
+def test_paths_of_the_paper_lead_to_numbers(paper: tuple[Path, Path]) -> None:
     log, bag = paper
     messages = first_messages(log) | first_messages(bag)
     layout = read_layout(log)
@@ -88,7 +88,7 @@ def test_every_path_of_the_paper_leads_to_a_number(paper: tuple[Path, Path]) -> 
     assert modes == [1.0, 1.0, 1.0, "run", "run", "run"]
 
 
-def test_the_paper_has_angles_torques_errors_estimates_and_ages(
+def test_the_paper_shows_all_kinds_of_quantities(
     paper: tuple[Path, Path],
 ) -> None:
     drawn = set(paths(read_layout(paper[0]), "Plot"))
@@ -106,7 +106,7 @@ def test_the_paper_has_angles_torques_errors_estimates_and_ages(
         assert f"/viz/{site}/theta_hat.data[4]" in drawn
 
 
-def test_every_path_of_a_recorded_session_leads_to_a_number(files: dict[str, Path]) -> None:
+def test_paths_of_recorded_sessions_lead_to_numbers(files: dict[str, Path]) -> None:
     messages = first_messages(files["live"]) | first_messages(files["bag"])
     layout = read_layout(files["live"])
     for path in paths(layout, "Plot"):

@@ -1,4 +1,4 @@
-"""No text of a log becomes HTML: in the whole page, and in each macro of each template."""
+"""Texts of a log never become HTML: in the whole page, and in each macro of each template."""
 
 import dataclasses
 import json
@@ -42,7 +42,7 @@ Call = tuple[str, str, dict[str, Any]]
 
 
 class Elements(HTMLParser):
-    """The elements of a page with the names of their attributes, and its texts."""
+    """The elements of a page with the names of their attributes, and the texts of the page."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class Elements(HTMLParser):
 
 
 def make_log(text: str) -> Log:
-    """A run whose log has a text wherever a log has free text."""
+    """Returns a log that has a given text wherever a log has free text."""
     source = logs.FOUR
     for key in ("title", "about", "assumed"):
         quoted = json.dumps([text] if key == "assumed" else text)
@@ -76,7 +76,7 @@ def make_log(text: str) -> Log:
 
 
 def render(log: Log, text: str) -> str:
-    """The report of a log, and what a notebook shows of it."""
+    """Returns the report of a log, and the HTML in a notebook."""
     certificate = certify(log)
     findings = [Finding(text, text, False), Finding("executed again", text, True)]
     page = render_report(
@@ -100,7 +100,7 @@ def test_hostile_log_adds_no_element() -> None:
 
 @cache
 def record_calls() -> list[Call]:
-    """Every use of a template while reports and results are rendered."""
+    """Returns every use of a template while reports and results are rendered."""
     calls: list[Call] = []
 
     def macro(template: str, name: str, /, **values: Any) -> Markup:
@@ -127,7 +127,7 @@ def record_calls() -> list[Call]:
 
 
 def fill(value: Any, text: str) -> Any:
-    """The value, with a text in place of each plain string that it contains."""
+    """Returns the value with a text in place of each plain string that it contains."""
     if isinstance(value, Markup) or value is None:
         return value
     if isinstance(value, str):
@@ -145,7 +145,8 @@ def fill(value: Any, text: str) -> Any:
         return type(value)(fill(item, text) for item in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
-            one.name: fill(getattr(value, one.name), text) for one in dataclasses.fields(value)
+            data_field.name: fill(getattr(value, data_field.name), text)
+            for data_field in dataclasses.fields(value)
         }
         return dataclasses.replace(value, **fields)
     return value

@@ -1,4 +1,4 @@
-"""What other programs read of a dataset of LeRobot is the log at the times of its frames."""
+"""A dataset of LeRobot contains the log at the times of its frames, as other programs read it."""
 
 import json
 from fractions import Fraction
@@ -37,13 +37,15 @@ PLACES = {"frame_index", "episode_index", "index", "task_index"}
 
 
 def log() -> Log:
-    """Users a and b, of which b has 150 Hz, and a slave c: from 4 to 5 s its shares change to 0.9 and 0.1."""
+    """Returns a log of users a and b, of which b has 150 Hz, and a slave c; from 4 to 5 s its
+    shares change to 0.9 and 0.1.
+    """
     return logs.busy().log
 
 
 @cache
 def without(*missing: tuple[float, float]) -> Log:
-    """The log without the slave's records of some times, s."""
+    """Returns the log without the slave's records of some times, s."""
 
     def keep(state: State) -> bool:
         return state.site != "c" or not any(a <= state.t_ns * 1e-9 < b for a, b in missing)
@@ -61,16 +63,16 @@ def read(folder: Path, place: str = "data") -> pl.DataFrame:
 
 
 def info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-    return found
+    facts: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    return facts
 
 
-def told(text: str, at_s: float, kind: str = "mark") -> Event:
+def make_event(text: str, at_s: float, kind: str = "mark") -> Event:
     return Event(member="a", boot=1, kind=kind, text=text, t_ns=round(at_s * 1e9))
 
 
 def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarray:
-    """A vector of the newest records at or before the times of frames, by exact fractions."""
+    """Returns a vector of the newest records at or before the times of frames, by exact fractions."""
     part = source[site]
     ticks = [int(Fraction(n, fps) * part.rate_hz) for n in range(count)]
     return np.array([getattr(part.by_tick[tick], field) for tick in ticks], dtype=np.float32)
@@ -78,31 +80,33 @@ def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarr
 
 def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
     folder = exported(tmp_path, log())
-    found = info(folder)
-    assert {key: found[key] for key in ("codebase_version", "fps", "video_path", "splits")} == {
+    info_text = info(folder)
+    assert {
+        key: info_text[key] for key in ("codebase_version", "fps", "video_path", "splits")
+    } == {
         "codebase_version": "v3.0",
         "fps": 30,
         "video_path": None,
         "splits": {"train": "0:1"},
     }
-    assert found["data_path"].format(chunk_index=0, file_index=0) == f"data/{FILE}"
+    assert info_text["data_path"].format(chunk_index=0, file_index=0) == f"data/{FILE}"
     schema = pq.read_schema(folder / "data" / FILE)
     wanted = {name: pa.list_(pa.float32(), size) for name, size in USERS.items()}
     wanted |= {"observation.state": pa.list_(pa.float32(), 4), "timestamp": pa.float32()}
     wanted |= {"next.done": pa.bool_(), **dict.fromkeys(PLACES, pa.int64())}
     assert {field.name: field.type for field in schema} == wanted
-    assert set(found["features"]) == set(wanted)
-    assert found["features"]["observation.state"] == {
+    assert set(info_text["features"]) == set(wanted)
+    assert info_text["features"]["observation.state"] == {
         "dtype": "float32",
         "shape": [4],
         "names": ["c.q1.pos", "c.q2.pos", "c.q1.vel", "c.q2.vel"],
     }
-    assert found["features"]["dominance"]["names"] == ["a", "b"]
-    assert found["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
+    assert info_text["features"]["dominance"]["names"] == ["a", "b"]
+    assert info_text["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
 
 
 @pytest.mark.parametrize("fps", [30, 7])
-def test_a_frame_has_the_newest_records_before_it(fps: int, tmp_path: Path) -> None:
+def test_frames_have_the_newest_earlier_records(fps: int, tmp_path: Path) -> None:
     """Of a run of 6 s, whose last ticks are at 5.995 s and, of b, at 5.9933 s."""
     frames = read(exported(tmp_path, log(), fps=fps))
     assert len(frames) == 6 * fps
@@ -121,7 +125,7 @@ def test_a_frame_has_the_newest_records_before_it(fps: int, tmp_path: Path) -> N
     assert frames["index"].to_list() == frames["frame_index"].to_list() == list(range(6 * fps))
 
 
-def test_whose_share_is_above_the_program_s_intervenes(tmp_path: Path) -> None:
+def test_users_above_the_programs_share_intervene(tmp_path: Path) -> None:
     """The program is b: a leads from 4 s on, and is at 0.7 half-way through the ramp."""
     frames = read(exported(tmp_path, log(), program="b"))
     shares = frames["dominance"].to_numpy()
@@ -129,13 +133,13 @@ def test_whose_share_is_above_the_program_s_intervenes(tmp_path: Path) -> None:
     assert shares[135] == pytest.approx([0.7, 0.3])
     assert shares[-1] == pytest.approx([0.9, 0.1])
     assert frames["intervention"].to_list() == [n > 120 for n in range(180)]
-    led = np.where(
+    leader = np.where(
         frames["intervention"].to_numpy()[:, None], frames["action.a"], frames["action.b"]
     )
-    assert np.array_equal(frames["action"].to_numpy(), led)
+    assert np.array_equal(frames["action"].to_numpy(), leader)
 
 
-def test_a_program_that_is_named_is_another_one(tmp_path: Path) -> None:
+def test_a_named_program_replaces_the_default(tmp_path: Path) -> None:
     frames = read(exported(tmp_path, log(), program="a"))
     assert not frames["intervention"].any()
     assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
@@ -156,8 +160,8 @@ def test_without_a_program_nobody_intervenes(tmp_path: Path) -> None:
 
 def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
     """Among others that held arms; a log without a policy has no intervention."""
-    taken = [told("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
-    taken += [told("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
+    taken = [make_event("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
+    taken += [make_event("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
     held = logs.rewritten(log(), others=taken)
     folder = exported(tmp_path, held, log())
     assert info(folder, "about")["program"] == "b and none"
@@ -167,9 +171,9 @@ def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
 
 
 def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
-    """1 to 2 s succeed, 3 to 4 s fail, and what begins at 5 s is interrupted by the end."""
+    """1 to 2 s succeed, 3 to 4 s fail, and the end interrupts the episode that begins at 5 s."""
     marks = [
-        told(f"episode {text}", at_s)
+        make_event(f"episode {text}", at_s)
         for text, at_s in (
             ("one begins", 1.0),
             ("one succeeded", 2.0),
@@ -178,7 +182,7 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
             ("three begins", 5.0),
         )
     ]
-    source = logs.rewritten(log(), others=[told("look", 0.5), *reversed(marks)])
+    source = logs.rewritten(log(), others=[make_event("look", 0.5), *reversed(marks)])
     folder = exported(tmp_path, source, episodes="marks", task="stack the cups")
     frames = read(folder)
     assert read(folder, "meta/episodes")["length"].to_list() == [30, 30, 30]
@@ -190,14 +194,14 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
     marked = np.vstack([whole[30:60], whole[90:120], whole[150:]])
     assert np.array_equal(frames["action.b"].to_numpy(), marked)
     (session,) = info(folder, "about")["sessions"]
-    outcomes = {one["name"]: one["outcome"] for one in session["episodes"]}
+    outcomes = {episode["name"]: episode["outcome"] for episode in session["episodes"]}
     assert outcomes == {"one": "succeeded", "two": "failed", "three": "not stated"}
     assert session["frames_outside_episodes"] == 90
     tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
     assert tasks.index.tolist() == ["stack the cups"]
 
 
-def test_a_log_without_marks_stays_one_episode_and_that_is_said(tmp_path: Path) -> None:
+def test_unmarked_logs_are_one_reported_episode(tmp_path: Path) -> None:
     settings = {"episodes": "marks"}
     summary = Exporter("lerobot", tmp_path / "said", settings=settings).export(log())
     assert f"no episode is marked in {log().source}" in summary
@@ -208,12 +212,12 @@ def test_a_log_without_marks_stays_one_episode_and_that_is_said(tmp_path: Path) 
 
 
 def test_an_episode_outside_the_records_is_refused(tmp_path: Path) -> None:
-    late = logs.rewritten(log(), others=[told("episode one begins", 7.0)])
+    late = logs.rewritten(log(), others=[make_event("episode one begins", 7.0)])
     with pytest.raises(LogError, match="no marked episode contains a time"):
         exported(tmp_path, late, episodes="marks")
 
 
-def test_the_reference_of_the_slave_is_an_observation_on_request(tmp_path: Path) -> None:
+def test_slave_references_are_optional_observations(tmp_path: Path) -> None:
     folder = exported(tmp_path, log(), observations="reference")
     names = info(folder)["features"]["observation.state"]["names"]
     assert names[:2] + names[4:] == ["c.q1.pos", "c.q2.pos", "c.q1.ref", "c.q2.ref"]
@@ -229,14 +233,14 @@ def test_the_environment_state_is_the_state(tmp_path: Path) -> None:
     assert np.array_equal(read(folder)["observation.environment_state"].to_numpy(), state)
 
 
-def test_the_plugin_needs_an_arm_that_it_can_hold(tmp_path: Path) -> None:
+def test_the_plugin_needs_a_holdable_arm(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="needs an operator of kind 'live' or 'own' at b"):
         exported(tmp_path, log(), observations="plugin")
     with pytest.raises(UsageError, match="the plugin can hold the arm of a or b, not of 'c'"):
         exported(tmp_path, log(), observations="plugin", site="c")
 
 
-def test_an_episode_ends_before_a_gap_and_nothing_bridges_it(tmp_path: Path) -> None:
+def test_episodes_end_before_gaps(tmp_path: Path) -> None:
     """Without 1.0 to 1.5 s: 1.0 s still has a record of 5 ms before it; so has 3.0 s in the short gap."""
     folder = exported(tmp_path, without((1.0, 1.5), (3.0, 3.02)))
     lengths = read(folder, "meta/episodes")["length"].to_list()
@@ -305,7 +309,7 @@ def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
         )
 
 
-def test_logs_of_other_arms_are_refused_and_leave_nothing(tmp_path: Path) -> None:
+def test_other_arms_are_refused_without_files(tmp_path: Path) -> None:
     other = trilat_net.simulate("two_sites", duration_s=0.2)
     with pytest.raises(LogError, match="the users or joints are not the same as in"):
         exported(tmp_path, log(), other)
@@ -336,14 +340,14 @@ def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
         ({"episodes": "mark"}, "episodes must be log or marks, not 'mark'"),
     ],
 )
-def test_settings_that_are_none_are_refused(
+def test_invalid_settings_are_refused(
     settings: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UsageError, match=said):
         Exporter("lerobot", tmp_path / "set", settings=settings).export(log())
 
 
-def test_a_form_without_settings_says_so(tmp_path: Path) -> None:
+def test_forms_without_settings_are_reported(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="csv has no setting 'fps'; csv has no settings"):
         Exporter("csv", tmp_path / "set", settings={"fps": 30})
     with pytest.raises(UsageError, match="exports a single log"):
@@ -357,7 +361,7 @@ def test_other_actions_are_refused(tmp_path: Path) -> None:
         Exporter("csv", tmp_path / "csv", settings={"actions": "tip"})
 
 
-def test_users_with_other_joints_are_told_to_use_tips(tmp_path: Path) -> None:
+def test_different_joints_are_told_to_use_tips(tmp_path: Path) -> None:
     source = trilat_net.simulate(parse_scenario(posed_arms(0.1)))
     with pytest.raises(LogError, match=r"m2 and m1 have different joints, .*: use actions tip"):
         exported(tmp_path, source, actions="joints")

@@ -1,4 +1,6 @@
-"""A figure and a format of exports are one file each: whoever knows them knows one put beside the others."""
+"""A figure and an export format are one file each: the program finds a file that was put beside
+the others.
+"""
 
 from pathlib import Path
 
@@ -68,20 +70,20 @@ print(json.dumps({
 
 
 @pytest.mark.long
-def test_files_beside_the_others_are_figures_and_formats_everywhere(tmp_path: Path) -> None:
+def test_added_files_are_figures_and_formats(tmp_path: Path) -> None:
     for name, text in {"figures/haste.py": FIGURE, "exports/counts.py": FORMAT}.items():
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text(text)
-    found = look(LOOK, tmp_path)
-    assert found["figures"][-1] == "haste"
-    assert found["completed"] == ["hands_moved", "haste"]
-    assert [Path(name).name for name in found["drawn"]] == ["haste.png", "haste.svg"]
-    assert found["told"] == "run.counts"
-    assert found["asked"] == "m 100 s 100"
-    assert "counts" in found["help"]
+    output = look(LOOK, tmp_path)
+    assert output["figures"][-1] == "haste"
+    assert output["completed"] == ["hands_moved", "haste"]
+    assert [Path(name).name for name in output["drawn"]] == ["haste.png", "haste.svg"]
+    assert output["told"] == "run.counts"
+    assert output["asked"] == "m 100 s 100"
+    assert "counts" in output["help"]
 
 
-def test_a_figure_with_two_definitions_is_refused_with_both_homes() -> None:
+def test_duplicate_figures_are_refused_with_both_files() -> None:
     with pytest.raises(
         ValueError, match=r"figure arms has two definitions, in .*arm_poses and .*run_overview"
     ):

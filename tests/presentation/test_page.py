@@ -30,7 +30,7 @@ VERDICTS = [
 
 
 class Page(HTMLParser):
-    """What a browser would make of the page: elements with attributes, and text by element."""
+    """The page as a browser builds it: elements with attributes, and text by element."""
 
     def __init__(self, html):
         super().__init__()
@@ -46,7 +46,7 @@ class Page(HTMLParser):
 
 
 def read(html):
-    """The page, and the data that its charts are drawn from."""
+    """Returns the page, and the data of its charts."""
     data = re.search(
         r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL
     )[1]
@@ -61,7 +61,7 @@ def column(table, n):
     return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
 
 
-def test_a_report_is_a_page_with_numbers_and_pictures(tmp_path):
+def test_a_report_has_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
     log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
     paths = write_report(
@@ -123,7 +123,7 @@ def test_texts_of_a_scenario_stay_texts():
     assert "trilat sim ./four.toml" in html  # not shipped: its text is on the page
 
 
-def test_page_holds_log_with_spike_of_one_tick():
+def test_a_page_holds_one_tick_spikes():
     def spike(state):
         return (
             msgspec.structs.replace(state, q=[9.5, 0.0])
@@ -148,7 +148,7 @@ def test_page_holds_log_with_spike_of_one_tick():
         )
 
 
-def test_the_page_tells_what_the_links_did_and_what_happened():
+def test_the_page_describes_links_and_events():
     html, data = page(logs.busy().log)
     assert (
         "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms"
@@ -176,7 +176,7 @@ def test_the_page_tells_what_the_links_did_and_what_happened():
         assert (np.diff(percent) >= 0.0).all()
 
 
-def test_the_page_of_a_plain_log_has_nothing_superfluous():
+def test_pages_of_plain_logs_have_nothing_superfluous():
     html, data = page(logs.simulated("paper"))
     assert data["changes"] == []
     assert set(map(len, data["spans"].values())) == {0}
@@ -190,7 +190,7 @@ def test_the_page_of_a_plain_log_has_nothing_superfluous():
 
 @pytest.mark.long
 @pytest.mark.parametrize("sites", [(), ("m2", "s")])
-def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
+def test_nearly_empty_logs_have_reports(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
     some = logs.timed(logs.simulated("paper"))
     log = logs.rewritten(
@@ -216,7 +216,7 @@ def test_error_chart_names_its_floor(name):
     assert (floor in chart["note"]) == (min(errors) < 1e-6)
 
 
-def test_a_run_that_diverged_has_a_page():
+def test_a_diverged_run_has_a_page():
     log = logs.diverged()
     html, _ = page(log)
     assert '<th scope="row">diverged</th><td>yes</td>' in html

@@ -1,4 +1,4 @@
-"""Who leads the slave, as the first screen of a report shows it."""
+"""The leaders of the slave on the first screen of a report."""
 
 import json
 import re
@@ -67,7 +67,7 @@ def test_one_master_leads_alone() -> None:
 
 
 @pytest.mark.parametrize("name", ["four", "busy"])
-def test_every_slave_that_follows_somebody_is_shown(name: str) -> None:
+def test_every_following_slave_is_shown(name: str) -> None:
     log = logs.busy().log if name == "busy" else logs.simulated(name)
     followers = {
         site
@@ -109,10 +109,10 @@ def test_the_bar_stands_below_the_slider(
         assert bar["y"] + bar["height"] <= size[1]
         assert bar["x"] == pytest.approx(slider["x"] + 8.0, abs=1.0)
         assert bar["width"] == pytest.approx(slider["width"] - 16.0, abs=1.0)
-        for share, words in ((0, "m1 90 %, m2 10 %"), (1000, "m1 10 %, m2 90 %")):
+        for share, bar_text in ((0, "m1 90 %, m2 10 %"), (1000, "m1 10 %, m2 90 %")):
             page.locator("#arms input").fill(str(share))
-            assert page.inner_text(".lead output") == words
+            assert page.inner_text(".lead output") == bar_text
         page.locator("#arms input").fill(str(round(1000 * 11.0 / 14.0)))
-        shown = re.findall(r"(\d+) %", page.inner_text(".lead output"))
-        assert [int(number) for number in shown] == [50, 50]
+        matches = re.findall(r"(\d+) %", page.inner_text(".lead output"))
+        assert [int(number) for number in matches] == [50, 50]
         watched.assert_whole()

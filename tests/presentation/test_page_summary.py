@@ -1,4 +1,4 @@
-"""The first lines of a report: a judgement that no number beside it contradicts."""
+"""The first lines of a report: a judgement that agrees with every number beside it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -42,12 +42,12 @@ def short_log() -> Log:
 
 
 def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certificate:
-    """A certificate of a run with a proof, which ends with a behaviour and an error."""
-    found = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
-    end = found.end._replace(
+    """Returns a certificate of a run with a proof, with the given behaviour and error at its end."""
+    certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
+    end = certificate.end._replace(
         behaviour=behaviour, end_error_rad=error_rad, reasons=(), operator_acts=False
     )
-    return replace(found, **{"end": end, "roots": STABLE_ROOTS, **fields})
+    return replace(certificate, **{"end": end, "roots": STABLE_ROOTS, **fields})
 
 
 def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> str:
@@ -64,7 +64,7 @@ def test_stable_run_names_its_proof() -> None:
     assert "the arms were at rest and agreed" in html
 
 
-def test_errors_that_stay_are_explained() -> None:
+def test_lasting_errors_are_explained() -> None:
     certificate = judge(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
     assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
     html = verdict_text(certificate)
@@ -73,7 +73,7 @@ def test_errors_that_stay_are_explained() -> None:
     assert "Stable means that disturbances die away, not that errors vanish" in html
 
 
-def test_hands_that_still_push_are_named() -> None:
+def test_pushing_hands_are_named() -> None:
     log = logs.simulated("paper")
     pushed = logs.rewritten(log, change=lambda row: logs.replaced(row, tau_x=[1.0, 0.0]))
     html = render_verdict(pushed, judge(EndBehaviour.CONVERGED, 0.4), ())
@@ -93,7 +93,7 @@ def test_small_oscillation_is_not_called_settled() -> None:
     assert "All errors were small then, but they do not die away." in html
 
 
-def test_open_run_names_its_first_reason() -> None:
+def test_an_open_run_names_its_first_reason() -> None:
     certificate = judge(EndBehaviour.HARDLY, 0.2, roots=None)
     assert certificate.stability is Stability.OPEN
     text = describe_basis(certificate)
@@ -120,7 +120,7 @@ def test_checks_that_passed_are_one_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("finding", "words"),
+    ("finding", "phrase"),
     [
         (WRONG, "<details open><summary>✗ Failed: executed again</summary>"),
         (
@@ -129,11 +129,11 @@ def test_checks_that_passed_are_one_line() -> None:
         ),
     ],
 )
-def test_check_that_did_not_pass_is_named(finding: Finding, words: str) -> None:
-    assert words in render_checks([PASSED, finding], {"missing": 0})
+def test_a_failed_check_is_named(finding: Finding, phrase: str) -> None:
+    assert phrase in render_checks([PASSED, finding], {"missing": 0})
 
 
-def test_key_numbers_say_where_and_when() -> None:
+def test_key_numbers_have_place_and_time() -> None:
     log = logs.simulated("paper")
     facts = summarise_run(log)
     html = render_key_numbers(log, facts)
@@ -159,18 +159,18 @@ def test_key_numbers_say_where_and_when() -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", "four"])
-def test_every_text_has_the_same_last_error(name: str) -> None:
+def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = logs.simulated(name)
-    found = certify(log)
+    certificate = certify(log)
     error = find_last_error(log)
     assert error is not None
     facts = summarise_run(log)
-    assert facts["max_error_end_rad"] == found.end.end_error_rad == error.value
+    assert facts["max_error_end_rad"] == certificate.end.end_error_rad == error.value
     assert f"{error.value:.3g} rad in the last second, of {error.joint}" in render_key_numbers(
         log, facts
     )
-    assert f"largest |e| {error.value:.3g} rad of {error.joint} and" in found.end.text
+    assert f"largest |e| {error.value:.3g} rad of {error.joint} and" in certificate.end.text
     table = _tabulate_sites(log, is_timed=False)
     row = next(row for row in table.rows if row[0] == error.site)
     assert list(row[-2:]) == [f"{error.value:.3g}", error.joint.removeprefix(f"{error.site} ")]
@@ -189,15 +189,15 @@ def test_limits_stand_under_the_judgement() -> None:
     )
     remark = "m1 was at its torque limit for 0.15 s"
     assert remark not in certify_run(log, twins=0).remarks
-    found = certify_run(at_limit, twins=0)
-    assert found.remarks == (remark,)
-    assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, found, ())
+    certificate = certify_run(at_limit, twins=0)
+    assert certificate.remarks == (remark,)
+    assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, certificate, ())
     for brief in (True, False):
-        texts = [block.lines()[0] for block in compose(found, brief=brief)]
-        place = texts.index(f"note {remark}")
-        reasons = [line.text for line in describe_certificate(found)]
-        assert place in (1, 2)  # before the reasons
-        assert texts[place + 1].endswith(reasons[1])
+        texts = [block.lines()[0] for block in compose(certificate, brief=brief)]
+        line_index = texts.index(f"note {remark}")
+        reasons = [line.text for line in describe_certificate(certificate)]
+        assert line_index in (1, 2)  # before the reasons
+        assert texts[line_index + 1].endswith(reasons[1])
 
 
 def test_log_without_records_has_dashes() -> None:
@@ -206,12 +206,12 @@ def test_log_without_records_has_dashes() -> None:
     assert html.count("<dd>–</dd>") == 4
 
 
-def test_end_error_of_a_pushed_arm_says_so() -> None:
+def test_end_errors_of_pushed_arms_are_marked() -> None:
     log = logs.simulated("paper")
-    words = "which a hand or a wall still pushes"
+    text = "which a hand or a wall still pushes"
     for torque_nm, is_pushed in ((1.0, True), (0.0, False)):
         run = logs.rewritten(
             log,
             change=lambda row, t=torque_nm: logs.replaced(row, tau_x=[t, 0.0]),  # type: ignore[misc]
         )
-        assert (words in render_key_numbers(run, summarise_run(run))) == is_pushed
+        assert (text in render_key_numbers(run, summarise_run(run))) == is_pushed

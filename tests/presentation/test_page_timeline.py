@@ -1,4 +1,4 @@
-"""What happened in a run, as sentences in the order of time."""
+"""The events of a run, as sentences in the order of time."""
 
 from tests.analysis import logs
 from tests.core.guarded_runs import stopped_log
@@ -14,34 +14,34 @@ def sentences(log: Log) -> list[str]:
 
 
 def test_plain_run_begins_pushes_and_ends() -> None:
-    told = sentences(logs.simulated("paper"))
-    assert told[0].startswith("0.000 The run starts; m1 follows m2 0.5, s 0.5; ")
-    assert any(" An operator pushes m1 to the end, with at most " in line for line in told)
-    assert any(" has the largest error of the run, " in line for line in told)
-    assert told[-1].endswith("The record ends.")
+    texts = sentences(logs.simulated("paper"))
+    assert texts[0].startswith("0.000 The run starts; m1 follows m2 0.5, s 0.5; ")
+    assert any(" An operator pushes m1 to the end, with at most " in line for line in texts)
+    assert any(" has the largest error of the run, " in line for line in texts)
+    assert texts[-1].endswith("The record ends.")
 
 
-def test_changes_and_modes_are_told_with_their_origin() -> None:
+def test_changes_and_modes_have_their_origin() -> None:
     log = logs.busy().log
-    told = sentences(log)
-    assert "2.200 b braked until 3.053 s." in told
-    assert any("(command, applied at tick 500 of a)." in line for line in told)
-    assert any("(scenario)." in line for line in told)
+    texts = sentences(log)
+    assert "2.200 b braked until 3.053 s." in texts
+    assert any("(command, applied at tick 500 of a)." in line for line in texts)
+    assert any("(scenario)." in line for line in texts)
     html = render_timeline(log, summarise_run(log))
-    shown, folded = html.split("<details>")
-    assert shown.count("<li>") == MAX_SHOWN
-    assert shown.count("<li>") + folded.count("<li>") == len(told)
+    visible, folded = html.split("<details>")
+    assert visible.count("<li>") == MAX_SHOWN
+    assert visible.count("<li>") + folded.count("<li>") == len(texts)
     assert [f"<b>{number}</b> " in html for number in (1, 2, 3)] == [True] * 3
 
 
 def test_sites_that_act_together_share_a_sentence() -> None:
-    told = sentences(stopped_log())
-    assert "0.000 m and s waited for the other sites until 0.100 s." in told
-    assert "2.000 s was stopped at 2.0 s (command, applied at tick 2000 of s)." in told
+    texts = sentences(stopped_log())
+    assert "0.000 m and s waited for the other sites until 0.100 s." in texts
+    assert "2.000 s was stopped at 2.0 s (command, applied at tick 2000 of s)." in texts
     stop = "2.000 s stood by order until 3.500 s (STOPPED: it was ordered to stop)."
-    assert stop in told
+    assert stop in texts
 
 
-def test_divergence_is_told() -> None:
+def test_divergence_is_reported() -> None:
     log = logs.diverged()
     assert any(f"diverged: {log.describe_divergence()}." in line for line in sentences(log))

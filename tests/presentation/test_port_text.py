@@ -14,7 +14,7 @@ from trilat_net.presentation.figures.linear_figures import (
 from trilat_net.presentation.linear_text import describe_ports
 
 
-def test_what_is_passive_is_said_in_a_word_each() -> None:
+def test_passive_ports_get_a_word_each() -> None:
     lines = describe_ports(section_of("p_d_margin_two"))
     assert lines[0].startswith("Ports of m, s, operators and environments off, 0.001-100 Hz")
     assert "evidence, no proof" in lines[0]
@@ -24,7 +24,7 @@ def test_what_is_passive_is_said_in_a_word_each() -> None:
     assert sum("the ratio is" in line for line in lines) == 2
 
 
-def test_what_is_not_passive_says_where_and_by_how_much() -> None:
+def test_active_ports_have_frequency_and_amount() -> None:
     section = section_of("two_sites")
     text = "\n".join(describe_ports(section))
     (span,) = section.velocity.minima.below
@@ -35,13 +35,13 @@ def test_what_is_not_passive_says_where_and_by_how_much() -> None:
     assert "some make it unstable at" in text
 
 
-def test_unstable_loop_is_said_to_be_that_and_nothing_else() -> None:
+def test_unstable_loops_get_no_further_words() -> None:
     lines = describe_ports(section_of("p_d_margin_two", (("control.d", 1.8),)))
     assert len(lines) == 2
     assert "the loop without operators is unstable" in lines[1]
 
 
-def test_a_clamp_that_makes_it_unstable_leaves_nothing_to_feel() -> None:
+def test_destabilising_clamps_leave_nothing_to_feel() -> None:
     lines = describe_ports(
         section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ())))
     )
@@ -49,7 +49,7 @@ def test_a_clamp_that_makes_it_unstable_leaves_nothing_to_feel() -> None:
     assert any("ranges more" in line for line in lines)
 
 
-def test_facts_are_json_with_the_numbers_of_the_lines() -> None:
+def test_facts_have_the_numbers_of_the_lines() -> None:
     for name in ("p_d_margin_two", "two_sites"):
         section = section_of(name)
         facts = json.loads(json.dumps(ports_to_json(section), allow_nan=False))
@@ -68,14 +68,14 @@ def test_facts_are_json_with_the_numbers_of_the_lines() -> None:
 @pytest.mark.parametrize(
     ("name", "form"), [("two_sites", make_print_size(3.5)), ("p_d_margin", REPORT_SIZE)]
 )
-def test_figures_are_drawn_at_the_width_that_is_asked_for(name: str, form: FigureSize) -> None:
+def test_figures_have_the_requested_width(name: str, form: FigureSize) -> None:
     for draw in (draw_port_impedance, draw_port_passivity):
         figure = draw(section_of(name), form)
         figure.savefig(BytesIO(), format="png", dpi=50)
         assert figure.get_size_inches()[0] == form.width_in
 
 
-def test_impedance_has_free_and_clamped_line_for_each_hand() -> None:
+def test_impedance_has_lines_for_each_hand() -> None:
     section = section_of("p_d_margin")
     size = draw_port_impedance(section).axes[0]
     assert len(size.lines) == 4
@@ -83,17 +83,19 @@ def test_impedance_has_free_and_clamped_line_for_each_hand() -> None:
     np.testing.assert_allclose(drawn, np.abs(section.transparency[0].free))
 
 
-def test_where_a_criterion_fails_is_shaded() -> None:
+def test_failing_criteria_are_shaded() -> None:
     section = section_of("two_sites")
     above, below = draw_port_passivity(section).axes
     assert len(above.patches) == len(section.velocity.minima.below)
-    assert len(below.patches) == sum(len(one.minima.below) for one in section.two_ports)
+    assert len(below.patches) == sum(
+        len(two_port.minima.below) for two_port in section.two_ports
+    )
     above, below = draw_port_passivity(section_of("p_d_margin")).axes
     assert not above.patches
     assert not below.patches
 
 
-def test_an_unstable_loop_has_figures_that_say_so() -> None:
+def test_figures_of_unstable_loops_say_so() -> None:
     section = section_of("p_d_margin_two", (("control.d", 1.8),))
     for draw in (draw_port_impedance, draw_port_passivity):
         figure = draw(section)

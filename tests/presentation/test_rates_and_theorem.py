@@ -14,33 +14,37 @@ from trilat_net.presentation.certificate_text import describe_certificate, descr
     ("factor", "remarks"), [(1.0, 0), (1.0 + 1e-6, 0), (1.1, 1), (0.5, 1), (-1, 1)]
 )
 @pytest.mark.parametrize("exact", [True, False])
-def test_rates_that_print_differently_are_explained(
+def test_rates_printing_differently_are_explained(
     factor: float, remarks: int, *, exact: bool
 ) -> None:
-    found = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
-    assert found.twins is not None
-    assert found.twins.worst is not None
-    rate_per_s = factor * found.twins.worst.rate_per_s
+    certificate = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
+    assert certificate.twins is not None
+    assert certificate.twins.worst is not None
+    rate_per_s = factor * certificate.twins.worst.rate_per_s
     roots = LoopRoots("stable", rate_per_s, exact, "this rest: stable")
-    lines = describe_certificate(replace(found, roots=roots))
-    told = [line for line in lines if line.text.startswith("of the two rates")]
-    assert [line.mark for line in told] == ["note"] * remarks
+    lines = describe_certificate(replace(certificate, roots=roots))
+    lines_on_rates = [line for line in lines if line.text.startswith("of the two rates")]
+    assert [line.mark for line in lines_on_rates] == ["note"] * remarks
     accuracy = "roots is exact" if exact else "roots is an approximation"
-    assert all(accuracy in line.text and "is measured" in line.text for line in told)
+    assert all(accuracy in line.text and "is measured" in line.text for line in lines_on_rates)
 
 
-def test_a_theorem_that_does_not_apply_has_not_passed() -> None:
-    found = runs.run("wall").certificate
-    (line,) = [line for line in describe_certificate(found) if line.text == found.verdict.text]
+def test_inapplicable_theorems_have_not_passed() -> None:
+    certificate = runs.run("wall").certificate
+    (line,) = [
+        line
+        for line in describe_certificate(certificate)
+        if line.text == certificate.verdict.text
+    ]
     assert line.mark == "note"
     assert line.text.startswith(
         "the theorem does not apply (premises that fail: hands); V rose"
     )
-    assert describe_theorem(found) == [
-        f"stability theorem of the paper (V: its energy function): {found.verdict.text}"
+    assert describe_theorem(certificate) == [
+        f"stability theorem of the paper (V: its energy function): {certificate.verdict.text}"
     ]
 
 
-def test_a_law_without_v_has_no_line_about_the_theorem() -> None:
+def test_laws_without_v_have_no_theorem() -> None:
     settings = {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}
     assert describe_theorem(runs.run("free", settings).certificate) == []

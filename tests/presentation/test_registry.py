@@ -1,4 +1,7 @@
-"""Figures for papers: sizes, fonts, words, files. What they show is tested beside what draws them."""
+"""Figures for papers: sizes, fonts, words, files.
+
+Their content is tested beside the functions that draw them.
+"""
 
 import re
 from functools import cache
@@ -35,7 +38,7 @@ def walled():
 
 @cache
 def example(name):
-    """A log that has something to show in a figure: changes and marks where it may."""
+    """Returns a log that has data for a figure: changes and marks if possible."""
     if name in ("operation", "operator_torques", "hands_moved"):
         return logs.simulated("paper")
     if name == "observed_energy":
@@ -46,7 +49,7 @@ def example(name):
 
 
 @cache
-def drawn(name, width_in):
+def draw_example(name, width_in):
     return figure(example(name), name, width_in)
 
 
@@ -62,14 +65,14 @@ def drawn(name, width_in):
         ("certificate", PAGE_IN),
     ],
 )
-def test_words_do_not_overlap_type_is_8_pt(name, width_in):
-    made = drawn(name, width_in)
-    assert made.get_figwidth() == width_in
-    assert misplaced(made) == []
-    assert {text.get_fontsize() for text in made.findobj(Text) if text.get_text().strip()} == {
-        8.0
-    }
-    for axes in made.axes:
+def test_words_have_8_pt_without_overlap(name, width_in):
+    figure_drawn = draw_example(name, width_in)
+    assert figure_drawn.get_figwidth() == width_in
+    assert misplaced(figure_drawn) == []
+    assert {
+        text.get_fontsize() for text in figure_drawn.findobj(Text) if text.get_text().strip()
+    } == {8.0}
+    for axes in figure_drawn.axes:
         spec = axes.get_subplotspec()
         below_it_is_the_same = len(axes.get_shared_x_axes().get_siblings(axes)) > 1
         if spec.is_last_row() or not below_it_is_the_same:
@@ -79,17 +82,17 @@ def test_words_do_not_overlap_type_is_8_pt(name, width_in):
 
 
 @pytest.mark.parametrize("name", ["parameter_estimates", "contact"])
-def test_a_pdf_is_one_page_with_fonts_and_no_date(name, tmp_path):
-    """252 pt are 3.5 in; Type 42 is TrueType, which journals take where they refuse Type 3."""
+def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
+    """252 pt are 3.5 in; Type 42 is TrueType, which journals accept, unlike Type 3."""
     before = dict(mpl.rcParams)
     path = tmp_path / f"{name}.pdf"
-    write_figure(drawn(name, COLUMN_IN), path, make_print_size(COLUMN_IN).dpi)
+    write_figure(draw_example(name, COLUMN_IN), path, make_print_size(COLUMN_IN).dpi)
     assert dict(mpl.rcParams) == before
     data = path.read_bytes()
     (box,) = re.findall(rb"/MediaBox \[ ?([\d. ]+) ?\]", data)
     left, bottom, right, top = map(float, box.split())
     assert (left, bottom, right) == (0.0, 0.0, pytest.approx(252.0))
-    assert top == pytest.approx(72.0 * drawn(name, COLUMN_IN).get_figheight())
+    assert top == pytest.approx(72.0 * draw_example(name, COLUMN_IN).get_figheight())
     assert len(re.findall(rb"/Type /Page\b(?!s)", data)) == 1
     assert b"/Type3" not in data
     assert data.count(b"/Subtype /Type0") == data.count(b"/FontFile2") > 0
@@ -107,7 +110,7 @@ def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
         assert int.from_bytes(first.read_bytes()[16:20], "big") == 2100  # 600 dots per inch
 
 
-def test_a_log_has_the_figures_that_it_has_something_for():
+def test_logs_have_the_figures_they_support():
     have = set(list_drawable_figures(walled()))
     assert {"contact", "operation", "positions"} <= have
     assert (
@@ -128,8 +131,10 @@ def test_a_log_has_the_figures_that_it_has_something_for():
     assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
 
 
-def test_force_of_wall_is_what_record_says_of_arm():
-    """J'F of the drawn force along the normal is the recorded torque ON the arm: the wall is all there is."""
+def test_wall_force_equals_the_recorded_torque():
+    """J'F of the drawn force along the normal is the recorded torque ON the arm, because no
+    other force acts.
+    """
     log = walled()
     part, wall = log["s"], log.scenario.sites["s"].environment[0]
     above = joint_motion.draw_contact(log).axes[0]
@@ -154,7 +159,7 @@ def test_force_of_wall_is_what_record_says_of_arm():
         (["contact"], {"formats": ["eps"]}, "pdf, png, svg"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_anything_is(names, options, said, tmp_path):
+def test_impossible_figures_are_refused_beforehand(names, options, said, tmp_path):
     with pytest.raises(UsageError, match=said):
         write_figures(walled(), tmp_path / "new", ["positions", *names], **options)
     assert not (tmp_path / "new").exists()

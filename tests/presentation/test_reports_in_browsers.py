@@ -49,7 +49,7 @@ def open_report(watched: WatchedPage, log: Log, folder: Path) -> Page:
 
 
 def unfold(page: Page) -> None:
-    """Opens everything that unfolds; charts are drawn once their part of the page is open."""
+    """Opens every folded part of the page; charts are drawn once their part is open."""
     page.evaluate(
         "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
     )
@@ -62,7 +62,7 @@ def count(page: Page, expression: str) -> int:
 
 
 def arms_drawn(page: Page) -> list[str]:
-    """The points of every arm in the player."""
+    """Returns the points of every arm in the player."""
     points: list[str] = page.evaluate(
         "[...document.querySelectorAll('#arms .arm')].map((arm) => arm.getAttribute('points'))"
     )
@@ -106,7 +106,7 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
 
 
 def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
-    """Also not where the chart has ticks of other sites within the gap of one."""
+    """Even if the chart has ticks of other sites within the gap of one."""
     with watched_page(browser, **SCREEN) as watched:
         page = open_report(watched, VARIED["single records"](), tmp_path)
         unfold(page)
@@ -155,7 +155,7 @@ def test_report_stays_whole_while_used(name: str, browser: Browser, tmp_path: Pa
 
 
 def zoom_in(page: Page) -> None:
-    """Drags over the first chart, by which all zoom; then all are shown whole again."""
+    """Drags over the first chart, which zooms all charts; then restores them."""
     area = page.locator(".u-over").first
     area.scroll_into_view_if_needed()
     box = area.bounding_box()
@@ -203,9 +203,9 @@ def test_whole_report_with_its_certificate_is_drawn(
     certificate = certify(log)
     path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
     observed, twins = certificate.observed, certificate.twins
-    shown = [certificate.balance, observed and observed.curves, twins and twins.pushes]
+    sections = [certificate.balance, observed and observed.curves, twins and twins.pushes]
     with watched_page(browser, **SCREEN) as watched:
         watched.page.goto(path.as_uri())
         unfold(watched.page)
         watched.assert_whole()
-        assert watched.page.locator("img.picture").count() == sum(map(bool, shown))
+        assert watched.page.locator("img.picture").count() == sum(map(bool, sections))

@@ -1,6 +1,7 @@
-"""How Rerun is called: with the log itself, or with what was made of it, and with its layout.
+"""Calls of Rerun: with the log itself, or with a file made from the log, and with its layout.
 
-What is shown where: every curve is in the file, has a name and shares a plot with its unit alone.
+The content of the layout: every curve is in the file, has a name and shares a plot only with
+its unit.
 """
 
 import re
@@ -28,7 +29,7 @@ from trilat_net.presentation.rerun_viewer import (
 
 
 class Rerun:
-    """A stand-in for the program: looks at its files while they are there, where it is called first."""
+    """A stand-in for the program, which looks at its files when it is first called."""
 
     def __init__(self, code: int = 0) -> None:
         self.code = code
@@ -48,7 +49,9 @@ class Rerun:
         return self.code
 
 
-def shown(paths: list[Path], show: ViewerOptions, code: int = 0) -> tuple[Rerun, list[str]]:
+def run_viewer(
+    paths: list[Path], show: ViewerOptions, code: int = 0
+) -> tuple[Rerun, list[str]]:
     said: list[str] = []
     rerun = Rerun(code)
     open_rerun(paths, lambda: open_log(*paths), show, said.append, rerun)
@@ -60,7 +63,7 @@ def never() -> Log:
 
 
 @pytest.mark.long
-def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> None:
+def test_finished_logs_with_views_are_opened_directly(files: dict[str, Path]) -> None:
     rerun = Rerun()
     open_rerun([files["live"]], never, ViewerOptions(web=True), lambda _: None, rerun)
     assert rerun.log == files["live"]
@@ -69,8 +72,8 @@ def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> N
     assert rerun.environment["RERUN_ANALYTICS_ENABLED"] == "false"
 
 
-def test_what_was_made_for_it_is_gone_when_viewer_is(files: dict[str, Path]) -> None:
-    rerun, said = shown([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
+def test_temporary_files_end_with_the_viewer(files: dict[str, Path]) -> None:
+    rerun, said = run_viewer([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
     assert "/lab/m/joint_states" in rerun.topics
     assert said == ["making standard channels of every record ..."]
     assert not rerun.log.exists()
@@ -78,22 +81,20 @@ def test_what_was_made_for_it_is_gone_when_viewer_is(files: dict[str, Path]) -> 
     assert files["live"].exists()
 
 
-def test_parts_are_shown_as_one_and_a_torn_log_too(
-    files: dict[str, Path], tmp_path: Path
-) -> None:
+def test_parts_and_torn_logs_are_shown_whole(files: dict[str, Path], tmp_path: Path) -> None:
     parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(files["live"].read_bytes()[:150_000])
     for paths, name in ((parts, parts[0].name), ([torn], "run.mcap")):
-        rerun, _ = shown(paths, ViewerOptions(save=Path("x.rrd")))
+        rerun, _ = run_viewer(paths, ViewerOptions(save=Path("x.rrd")))
         assert rerun.log.name == name
         assert {"/lab/m/joint_states", "/lab/s/error"} <= rerun.topics
 
 
-def test_a_name_that_rerun_does_not_take_is_replaced(
+def test_names_unsuitable_for_rerun_are_replaced(
     files: dict[str, Path], tmp_path: Path
 ) -> None:
-    """It would find another one for the log than for its layout, and complain."""
+    """Rerun would find different names for the log and for its layout, and complain."""
     names = {
         "run.mcap": "run",
         "my run.2.mcap": "my-run-2",
@@ -102,17 +103,17 @@ def test_a_name_that_rerun_does_not_take_is_replaced(
     }
     assert {name: make_application_id(Path(name)) for name in names} == names
     (tmp_path / "ü.mcap").write_bytes(files["live"].read_bytes())
-    rerun, _ = shown([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
+    rerun, _ = run_viewer([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
     assert rerun.log.stem == "log"
     assert "/viz/m/error" in rerun.topics
 
 
-def test_a_browser_is_told_where_to_go(files: dict[str, Path]) -> None:
-    rerun, (told,) = shown([files["live"]], ViewerOptions(web=True))
+def test_browsers_get_an_address(files: dict[str, Path]) -> None:
+    rerun, (message,) = run_viewer([files["live"]], ViewerOptions(web=True))
     page = rerun.command[rerun.command.index("--web-viewer-port") + 1]
     port = rerun.command[rerun.command.index("--port") + 1]
     assert "--serve-web" in rerun.command
-    assert told.startswith(
+    assert message.startswith(
         f"open http://127.0.0.1:{page}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
     )
 
@@ -124,24 +125,24 @@ def test_a_window_needs_a_display(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(rerun_viewer.sys, "platform", "linux")
     with pytest.raises(UsageError, match=r"no display here; .* web"):
-        shown([files["live"]], ViewerOptions())
+        run_viewer([files["live"]], ViewerOptions())
     monkeypatch.setenv("DISPLAY", ":0")
-    rerun, _ = shown([files["live"]], ViewerOptions())
+    rerun, _ = run_viewer([files["live"]], ViewerOptions())
     assert "--serve-web" not in rerun.command
     assert "--save" not in rerun.command
 
 
-def test_what_fails_is_told(
+def test_failures_are_reported(
     files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     web = ViewerOptions(web=True)
     with pytest.raises(RunFailed, match="Rerun ended with exit code 3"):
-        shown([files["live"]], web, code=3)
+        run_viewer([files["live"]], web, code=3)
     with pytest.raises(LogError, match="No such file"):
-        shown([tmp_path / "none.mcap"], web)
+        run_viewer([tmp_path / "none.mcap"], web)
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(UsageError, match=re.escape(format_extra_install("view"))):
-        shown([files["live"]], web)
+        run_viewer([files["live"]], web)
 
 
 def test_rerun_takes_log_and_layout_into_one_recording(
@@ -163,9 +164,9 @@ def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], Pl
     }
 
 
-def test_every_curve_is_of_a_channel_in_the_file(files: dict[str, Path]) -> None:
-    for channels, shown in boards(files).values():
-        for page in shown.pages.values():
+def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
+    for channels, panels in boards(files).values():
+        for page in panels.pages.values():
             for plot in (plot for row in page for plot in row):
                 for entity, names, visible in plot.curves:
                     topic = entity if entity in channels else entity.rpartition("/")[0]
@@ -174,16 +175,16 @@ def test_every_curve_is_of_a_channel_in_the_file(files: dict[str, Path]) -> None
                     assert all(names)
 
 
-def test_every_site_has_its_column_and_every_quantity_its_row(files: dict[str, Path]) -> None:
-    channels, shown = boards(files)["live"]
-    assert list(shown.pages) == ["Motion", "Speeds, estimates", "Links, timing"]
-    for page in shown.pages.values():
+def test_sites_are_columns_and_quantities_rows(files: dict[str, Path]) -> None:
+    channels, panels = boards(files)["live"]
+    assert list(panels.pages) == ["Motion", "Speeds, estimates", "Links, timing"]
+    for page in panels.pages.values():
         for row in page:
             assert [plot.title.partition(":")[0] for plot in row] == list(SCENARIO.names)
-    first = shown.pages["Motion"][0][0]
+    first = panels.pages["Motion"][0][0]
     assert first.title == "m: joint angles and reference (rad)"
     assert first.curves[0].names == ("m_q1", "m_q2", "m_q1_ref", "m_q2_ref")
-    assert shown.lines == "/viz/log"
+    assert panels.lines == "/viz/log"
     assert {"/viz/log", "/viz/events"} <= set(channels)
 
 
@@ -205,7 +206,7 @@ def test_a_bag_shows_the_reference_beside_the_joints(
     assert of["bag"][1].lines == "/lab/log"
 
 
-def test_what_there_is_not_takes_no_room(files: dict[str, Path]) -> None:
+def test_missing_quantities_take_no_room(files: dict[str, Path]) -> None:
     rows = boards(files)["virtual"][1].pages["Links, timing"]
     assert [row[0].title for row in rows] == ["m: age of samples in use, by peer (ms)"]
     assert build_plot_layout({}) == PlotLayout({}, "")
@@ -217,14 +218,12 @@ def test_what_there_is_not_takes_no_room(files: dict[str, Path]) -> None:
     )
 
 
-def test_a_number_of_two_dimensions_has_the_name_of_both(files: dict[str, Path]) -> None:
+def test_two_dimensional_numbers_are_named_by_both(files: dict[str, Path]) -> None:
     delays = boards(files)["live"][1].pages["Links, timing"][1]
     assert delays[0].curves[0].names == ("s median", "s max")
 
 
-def test_a_file_without_an_index_has_no_channels_to_show(
-    files: dict[str, Path], tmp_path: Path
-) -> None:
+def test_files_without_index_have_no_channels(files: dict[str, Path], tmp_path: Path) -> None:
     for content in (b"", b"nonsense" * 100, files["live"].read_bytes()[:50_000]):
         (tmp_path / "x.mcap").write_bytes(content)
         assert read_ros2_channels(tmp_path / "x.mcap") == {}

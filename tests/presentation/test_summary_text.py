@@ -1,4 +1,4 @@
-"""What a terminal is told of links, changes, modes and clocks.
+"""The text of links, changes, modes and clocks on a terminal.
 
 Text tables: the same cells on a terminal, in Markdown and as lines.
 """
@@ -28,12 +28,12 @@ from trilat_net.presentation.summary_text import (
 )
 
 
-def test_run_of_constant_links_without_loss_is_not_worth_line():
+def test_constant_links_without_loss_get_no_line():
     for name in ("paper", "free", "two_sites", "four"):
         assert format_run_lines(logs.simulated(name)) == []
 
 
-def test_a_link_says_what_was_stated_and_what_was_seen():
+def test_links_give_stated_and_measured_values():
     link = {"link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50}
     line = format_link_lines(trilat_net.simulate("two_sites", {"duration_s": 2, **link}))[0]
     assert line.startswith("link s->m: stated uniform 200 +- 28.9 ms; effective 16")
@@ -41,7 +41,7 @@ def test_a_link_says_what_was_stated_and_what_was_seen():
     assert "lost" not in line
 
 
-def test_what_happened_is_told_once():
+def test_events_are_reported_once():
     lines = format_run_lines(logs.busy().log)
     link = "the link c->a was set to uniform 30 +- 17.3 ms, from 3 s on"
     shares = "the shares of c were set to a 0.9, b 0.1 within 1 s, from 4 s on"
@@ -53,7 +53,7 @@ def test_what_happened_is_told_once():
     assert "in a row" in link
 
 
-def test_arm_that_was_stopped_is_told_first_and_in_large():
+def test_stopped_arms_are_reported_first():
     log = stopped_log()
     assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to stop"
     assert (
@@ -81,13 +81,13 @@ def test_arm_that_was_stopped_is_told_first_and_in_large():
         ("run", LifeReason.ALIGNED, None),
     ],
 )
-def test_an_alarm_says_what_to_do(mode, reason, advice):
+def test_alarms_say_what_to_do(mode, reason, advice):
     alarm = find_alarm("x", "s", mode, [0.0, 0.0, 0.0, 0.0, 0.0, float(reason)], 2)
     assert (alarm is None) == (advice is None)
     assert alarm is None or alarm.advice.endswith(advice)
 
 
-def test_who_goes_on_without_a_peer_says_so():
+def test_continuing_without_a_peer_is_reported():
     layout = Layout()
     mem = [0.0] * layout.count_life_memory(2) + [0.0, -1.0]
     assert layout.list_lost_peers(mem, ("m1", "m2")) == ["m2"]
@@ -98,7 +98,7 @@ def test_who_goes_on_without_a_peer_says_so():
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 5, [0.0] * 5 + [1e9], [0.0] * 5 + [-1.0]])
-def test_a_record_of_a_stranger_raises_no_alarm(mem):
+def test_foreign_records_raise_no_alarm(mem):
     assert find_alarm("x", "s", "fault", mem, 2) is None
 
 
@@ -113,7 +113,7 @@ def statistics(tick, **clock):
     none = {"m1": 0, "s": 0}
     counts = dict.fromkeys(("accepted", "late", "duplicate", "refused", "age_us"), none)
     zeros = dict.fromkeys(("late_max_us", "busy_max_us", "overruns"), 0)
-    place = {
+    facts = {
         "v": 2,
         "site": "m2",
         "boot": 1,
@@ -121,11 +121,11 @@ def statistics(tick, **clock):
         "t_ns": tick * 5_000_000,
         "mode": "run",
     }
-    return LinkStats(**place, **counts, **zeros, dropped={}, **clock)
+    return LinkStats(**facts, **counts, **zeros, dropped={}, **clock)
 
 
 def clocked():
-    """Two statistics and an estimate of m2: the clock of m1 is another one, that of s is its own."""
+    """Returns two statistics and an estimate of m2: m1 has another clock, s its own."""
     first = {
         "offset_us": {"m1": 3_000_000, "s": 0},
         "bound_us": {"m1": 200, "s": 0},
@@ -143,7 +143,7 @@ def clocked():
     return logs.rewritten(logs.simulated("paper"), driver="live", others=others)
 
 
-def test_a_clock_is_told_as_it_stood_at_the_end():
+def test_clocks_are_reported_as_at_the_end():
     use = summarise_clock(clocked(), "m1", "m2")
     assert (use.offset_first_us, use.offset_us) == (3_000_000, 3_000_100)
     assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (
@@ -160,7 +160,7 @@ def test_a_clock_is_told_as_it_stood_at_the_end():
     )
 
 
-def test_shared_clock_and_log_without_one_are_not_worth_line():
+def test_shared_clocks_get_no_line():
     shared = summarise_clock(clocked(), "s", "m2")
     assert shared is not None
     assert shared.shared
@@ -168,7 +168,7 @@ def test_shared_clock_and_log_without_one_are_not_worth_line():
     assert format_clock_lines(logs.simulated("paper")) == []
 
 
-def test_what_ended_the_run_is_a_line_without_controls() -> None:
+def test_the_cause_of_the_end_is_one_line() -> None:
     long = "the law a:B of s failed at tick 3: \x1b[31m" + "x" * 1000
     said = [
         SimpleNamespace(kind=kind, text=text)
@@ -210,7 +210,7 @@ def test_markdown_escapes_bars_and_marks_numbers() -> None:
     assert first == r"| m1 | 40.5 | \|e\| [red] |"
 
 
-def test_a_terminal_gets_every_cell_and_no_control_characters() -> None:
+def test_terminals_get_all_cells_without_control_characters() -> None:
     console = Console(file=StringIO(), width=12)
     console.print(TABLE._replace(styles={"7": "green"}).rich())
     text = console.file.getvalue()  # type: ignore[attr-defined]

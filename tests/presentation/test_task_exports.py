@@ -1,6 +1,6 @@
-"""Exports of sites that follow with their end effectors, as other people's programs read them.
+"""Exports of sites that follow with their end effectors, as other programs read them.
 
-The export as a bag: in order of arrival, as long as the log, refused where the log is broken.
+The export as a bag: in order of arrival, as long as the log, refused if the log is broken.
 """
 
 import csv
@@ -71,7 +71,9 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
 
 def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
     site = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)["m"]
-    (table,) = (one for one in log().tables() if one.label == "m_state")
+    (table,) = (
+        table_of_site for table_of_site in log().tables() if table_of_site.label == "m_state"
+    )
     frame = to_data_frame(table)
     for field, heads in HEADS.items():
         wanted = getattr(log()["m"], field)
@@ -80,7 +82,7 @@ def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
 
 
 def list_numbers(message: Any) -> list[float]:
-    """The place, velocity or force of a stamped message."""
+    """Returns the place, velocity or force of a stamped message."""
     if hasattr(message, "pose"):
         vector = message.pose.position
     else:
@@ -90,20 +92,20 @@ def list_numbers(message: Any) -> list[float]:
 
 def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
     path = exported("ros2", tmp_path)
-    found: dict[str, list[list[float]]] = {}
+    columns: dict[str, list[list[float]]] = {}
     with AnyReader([path]) as bag:
         for connection, _, data in bag.messages():
             if connection.topic.startswith("/planar/s/") and connection.msgtype.endswith(
                 "Float64MultiArray"
             ):
                 message = bag.deserialize(data, connection.msgtype)
-                found.setdefault(connection.topic, []).append(message.data.tolist())
+                columns.setdefault(connection.topic, []).append(message.data.tolist())
             if (
                 connection.topic.startswith("/planar/s/")
                 and "geometry_msgs" in connection.msgtype
             ):
                 message = bag.deserialize(data, connection.msgtype)
-                found.setdefault(connection.topic, []).append(list_numbers(message))
+                columns.setdefault(connection.topic, []).append(list_numbers(message))
         types = {connection.topic: connection.msgtype for connection in bag.connections}
     part = log()["s"]
     for topic, vectors in {
@@ -114,7 +116,7 @@ def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
         "tip_wrench": -part.wrench,
         "error": part.e,
     }.items():
-        assert np.array_equal([row[:3] for row in found[f"/planar/s/{topic}"]], vectors)
+        assert np.array_equal([row[:3] for row in columns[f"/planar/s/{topic}"]], vectors)
     assert types["/planar/s/joint_states"] == "sensor_msgs/msg/JointState"
     assert types["/planar/s/robot_description"] == "std_msgs/msg/String"
     assert types["/tf"] == "tf2_msgs/msg/TFMessage"
@@ -135,14 +137,14 @@ def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
 def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
-    path, told = tmp_path / "bag.mcap", list[int]()
-    export_ros2(opened(recorded("paper")), path, told.append)
+    path, log_times = tmp_path / "bag.mcap", list[int]()
+    export_ros2(opened(recorded("paper")), path, log_times.append)
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages(log_time_order=False))
     times = [message.log_time for _, _, message in messages]
     assert times == sorted(times)
     topics = [channel.topic for _, channel, _ in messages]
-    assert sum(topic.endswith("/joint_states") for topic in topics) == sum(told) == 3 * 120
+    assert sum(topic.endswith("/joint_states") for topic in topics) == sum(log_times) == 3 * 120
     assert {"/paper/m1/link_age", "/paper/events", "/paper/log", "/tf", "/diagnostics"} <= set(
         topics
     )
@@ -151,7 +153,7 @@ def test_messages_are_in_order_of_arrival(
     )
 
 
-def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
+def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
     """A gap in the log is a gap in the bag."""
     log = opened(
         edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r)
@@ -163,7 +165,7 @@ def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
     assert len(states) == 100
 
 
-def test_a_record_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+def test_unreadable_records_are_reported(tmp_path: Path) -> None:
     log = opened(
         edited(
             recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r

@@ -60,19 +60,19 @@ SHORT = {"duration_s": 2.0, "rate_hz": 200}
 
 
 def simulate(name: str, overrides: Mapping[str, Any] = {}) -> Log:
-    """A short run of a shipped scenario."""
+    """Returns a short run of a shipped scenario."""
     return trilat_net.simulate(load_scenario(name, {**SHORT, **overrides}))
 
 
 def run_with_law(law: str) -> Log:
-    """A short run in which every site has a law."""
+    """Returns a short run in which every site has a law."""
     name, settings = LAW_SETTINGS[law]
     named = {} if "control" in settings else {"control.law": law}
     return simulate(name, {**named, **settings})
 
 
 def run_session(scenario: Scenario, orders: tuple[tuple[float, str], ...] = ()) -> Log:
-    """A session of sites and a recorder; the slave is given orders at times, s after the start."""
+    """Returns a session of sites and a recorder; the slave is given orders at times, s after the start."""
     with TemporaryDirectory() as folder:
         session = Session.whole(scenario, Path(folder), ends={})
 
@@ -89,13 +89,13 @@ def run_session(scenario: Scenario, orders: tuple[tuple[float, str], ...] = ()) 
 
 
 def in_fault() -> Log:
-    """A slave under the rule `glide` that its hand pushes beyond its limit of speed."""
+    """Returns a slave under the rule `glide` that its hand pushes beyond its limit of speed."""
     limits = {"qd_limit_rad_s": 0.2}
     return trilat_net.simulate(guarded(limits, where="sites.s."))
 
 
 def torn(ticks: int, *sites: str) -> Log:
-    """A log that ends after few ticks, without some sites."""
+    """Returns a log that ends after few ticks, without some sites."""
     whole = logs.timed(logs.simulated("paper"))
     return logs.rewritten(
         whole,
@@ -106,7 +106,7 @@ def torn(ticks: int, *sites: str) -> Log:
 
 
 def with_gaps() -> Log:
-    """A log in which a site has single records between gaps."""
+    """Returns a log in which a site has single records between gaps."""
     return logs.rewritten(
         logs.simulated("paper"), lambda record: record.site != "m1" or record.tick % 100 == 0
     )

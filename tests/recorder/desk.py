@@ -1,4 +1,6 @@
-"""A recording into memory, on a clock that the test moves, and sites that remember what they sent."""
+"""A recording into memory, on a clock that the test moves, and sites that remember their
+messages.
+"""
 
 import io
 from collections.abc import Callable, Iterator, Sequence
@@ -35,9 +37,9 @@ SCENARIO = load_scenario("two_sites", {"duration_s": 0.05})
 TICKS = SCENARIO.ticks("m")
 
 
-def told(name: str, **facts: object) -> Info:
+def answer_info(name: str, **facts: object) -> Info:
     scenario = {"scenario_sha256": SCENARIO.sha256, "scenario": SCENARIO.text}
-    return parties.told(name, BOOTS[name], **{**scenario, **facts})
+    return parties.answer_info(name, BOOTS[name], **{**scenario, **facts})
 
 
 def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:
@@ -67,13 +69,13 @@ def end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> 
 
 
 class Memory:
-    """What a site answers when it is asked for its past; at most so many messages at once.
+    """The answers of a site to requests for its past, with a bounded number of messages each.
 
     Attributes:
-        made: all that it has made, by channel.
-        oldest: number of the oldest message that it still has, by channel.
-        asked: every question that reached it.
-        replies: what becomes of an answer on its way: the payloads that arrive.
+        made: All messages that the site made, by channel.
+        oldest: Number of the oldest remembered message, by channel.
+        asked: Every request that reached the site.
+        replies: Changes an answer on its way, and returns the payloads that arrive.
     """
 
     def __init__(self, network: LocalNetwork, name: str, chunk: int = 64) -> None:
@@ -86,22 +88,22 @@ class Memory:
 
     def answer(self) -> None:
         while (question := self._questions.poll()) is not None:
-            wanted = decode(question.payload, BackfillRequest)
-            self.asked.append(wanted)
-            for payload in self.replies(encode(self.past(wanted))):
+            decoded = decode(question.payload, BackfillRequest)
+            self.asked.append(decoded)
+            for payload in self.replies(encode(self.past(decoded))):
                 question.reply(payload)
 
     def past(self, wanted: BackfillRequest) -> Backfill:
-        made = self.made[wanted.channel]
-        first = max(wanted.first, min(self.oldest[wanted.channel], len(made)))
+        numbers_made = self.made[wanted.channel]
+        first = max(wanted.first, min(self.oldest[wanted.channel], len(numbers_made)))
         last = min(wanted.last, first + self.chunk - 1)
         return Backfill(
             member=self.name,
             boot=BOOTS[self.name],
             channel=wanted.channel,
             first=first,
-            payloads=list(made[first : last + 1]),
-            made=len(made),
+            payloads=list(numbers_made[first : last + 1]),
+            made=len(numbers_made),
         )
 
 
@@ -122,10 +124,10 @@ class Desk:
         self.reports: Inbox = listener.inbox(topics.key(SESSION, topics.RECORDER, topics.STATS))
         self.stream = io.BytesIO()
         self.tap = InboundQueue(self.clock)
-        own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
-        info = told(topics.RECORDER, scenario="", scenario_sha256="")
+        key = topics.key(SESSION, topics.RECORDER, topics.EVENT)
+        info = answer_info(topics.RECORDER, scenario="", scenario_sha256="")
         publisher = EventPublisher(
-            self.bus, SESSION, info, lambda payload: self.tap.receive(own, payload)
+            self.bus, SESSION, info, lambda payload: self.tap.receive(key, payload)
         )
         writer = LogWriter(
             self.stream, scenario, SESSION, "live", epoch.unix_ns, collect_provenance()
@@ -148,7 +150,7 @@ class Desk:
         self.recording.write(self.tap, self.clock.monotonic_ns())
 
     def rounds(self, count: int, *sites: Memory, step_ns: int = 10 * MS) -> None:
-        """Time goes on, while the recorder works and these sites answer."""
+        """Lets time pass, while the recorder works and the given sites answer."""
         for _ in range(count):
             self.wait(step_ns)
             self.write()

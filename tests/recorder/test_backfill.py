@@ -1,4 +1,4 @@
-"""Whatever the network loses, doubles and delays: the log has all that came or could be had, each once."""
+"""Under any loss, duplication and delay, the log has every message that arrived or was available, once."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -55,7 +55,7 @@ SENT = sorted(
 
 @dataclass
 class Way:
-    """What becomes of the messages on their way, by their place in SENT; and of the answers, in turn."""
+    """The fate of the messages on their way, by their place in SENT; and of the answers, in turn."""
 
     lost: set[int] = field(default_factory=set)
     twice: set[int] = field(default_factory=set)
@@ -65,13 +65,13 @@ class Way:
     chunk: int = 64
 
     def deliveries(self) -> list[tuple[int, str, int]]:
-        """What comes: (when since the epoch, channel, number)."""
-        came = []
-        for place, (sent_ns, channel, number) in enumerate(SENT):
-            if place not in self.lost:
-                at_ns = sent_ns + 137_000 + self.late_ms.get(place, 0) * MS
-                came += [(at_ns, channel, number)] * (2 if place in self.twice else 1)
-        return sorted(came)
+        """Yields arrivals: (when since the epoch, channel, number)."""
+        arrivals = []
+        for index, (sent_ns, channel, number) in enumerate(SENT):
+            if index not in self.lost:
+                at_ns = sent_ns + 137_000 + self.late_ms.get(index, 0) * MS
+                arrivals += [(at_ns, channel, number)] * (2 if index in self.twice else 1)
+        return sorted(arrivals)
 
 
 ARRIVES: dict[str, Callable[[bytes], Sequence[bytes]]] = {
@@ -101,7 +101,7 @@ WRONG: dict[str, Callable[[Backfill], dict[str, Any]]] = {
 
 
 def lie(how: str, payload: bytes) -> Sequence[bytes]:
-    """What arrives of an answer."""
+    """Returns the arriving part of an answer."""
     if how in ARRIVES:
         return ARRIVES[how](payload)
     past = decode(payload, Backfill)
@@ -113,7 +113,7 @@ def ways(draw: st.DrawFn) -> Way:
     places = st.integers(0, len(SENT) - 1)
     runs = draw(st.lists(st.tuples(places, st.integers(1, len(SENT))), max_size=4))
     lost = draw(st.sets(places, max_size=30)) | {
-        place for first, count in runs for place in range(first, min(first + count, len(SENT)))
+        index for first, count in runs for index in range(first, min(first + count, len(SENT)))
     }
     return Way(
         lost,
@@ -126,7 +126,7 @@ def ways(draw: st.DrawFn) -> Way:
 
 
 class Run:
-    """A session in which one site sends all it makes, and the other is gone."""
+    """A session in which one site sends all its messages, and the other is gone."""
 
     def __init__(self, way: Way, clock: ManualClock | None = None) -> None:
         self.way = way
@@ -137,7 +137,7 @@ class Run:
         self._asked = 0
 
     def _reply(self, payload: bytes) -> Sequence[bytes]:
-        """Every fourth answer at least comes as it is: nobody is patient for ever."""
+        """Delivers at least every fourth answer unchanged, because requests end after some attempts."""
         self._asked += 1
         turn = self._asked - self._asked // 4 - 1
         if self._asked % 4 == 0 or turn >= len(self.way.answers):
@@ -162,7 +162,7 @@ class Run:
             self.site.answer()
 
     def until_stored(self) -> Event:
-        """Goes on until the recorder says that it has all of it."""
+        """Continues until the recorder has every message."""
         for _ in range(400):
             stored = [event for event in self.desk.said() if event.kind == "stored"]
             if stored:
@@ -173,7 +173,7 @@ class Run:
 
 @given(ways())
 @settings(max_examples=40, deadline=None)
-def test_the_log_has_all_that_arrived_or_could_be_requested(way: Way) -> None:
+def test_logs_have_all_obtainable_messages(way: Way) -> None:
     run = Run(way)
     run.live(2600 * MS)
     stored = run.until_stored()
@@ -185,25 +185,25 @@ def test_the_log_has_all_that_arrived_or_could_be_requested(way: Way) -> None:
             file.setdefault(channel, []).append((number, message.log_time - UNIX_NS))
     for channel, made in MADE.items():
         account = run.desk.recording.accounts[topics.key(SESSION, "m", channel)]
-        came = [(at_ns, number) for at_ns, c, number in way.deliveries() if c == channel]
+        arrivals = [(at_ns, number) for at_ns, c, number in way.deliveries() if c == channel]
         numbers = [number for number, _ in file.get(channel, [])]
-        truth = {number for _, number in came} | set(range(way.oldest[channel], len(made)))
+        truth = {number for _, number in arrivals} | set(range(way.oldest[channel], len(made)))
         assert sorted(numbers) == sorted(truth)
         live = [(at_ns, number) for number, at_ns in file.get(channel, []) if at_ns % MS]
-        assert set(live) <= set(came)
+        assert set(live) <= set(arrivals)
         assert (account.expected, account.received) == (len(made), len(truth))
         assert account.missing == len(made) - len(truth)
         assert account.refilled == len(truth) - len(live)
-        assert account.duplicate == len(came) - len(live)
+        assert account.duplicate == len(arrivals) - len(live)
         passed = [
-            number < max(n for _, n in came[: came.index((at_ns, number)) + 1])
+            number < max(n for _, n in arrivals[: arrivals.index((at_ns, number)) + 1])
             for at_ns, number in live
         ]
         assert account.reordered == sum(passed)
         assert {n for first, last in account.gaps for n in range(first, last + 1)} == (
             set(range(len(made))) - truth
         )
-        stamps = sorted(at_ns for at_ns, _ in came)
+        stamps = sorted(at_ns for at_ns, _ in arrivals)
         silence = max((b - a for a, b in pairwise(stamps)), default=0)
         assert account.silence_ns == silence
     missing = sum(account.missing for account in run.desk.recording.accounts.values())
@@ -212,7 +212,7 @@ def test_the_log_has_all_that_arrived_or_could_be_requested(way: Way) -> None:
 
 
 @pytest.mark.parametrize("late_ms", [{}, dict.fromkeys(range(0, len(SENT), 3), 25)])
-def test_who_hears_everything_in_the_end_asks_nothing(late_ms: dict[int, int]) -> None:
+def test_complete_recorders_ask_for_nothing(late_ms: dict[int, int]) -> None:
     run = Run(Way(late_ms=late_ms))
     run.live(2100 * MS)
     run.until_stored()
@@ -220,7 +220,7 @@ def test_who_hears_everything_in_the_end_asks_nothing(late_ms: dict[int, int]) -
     assert run.desk.recording.dropped == Counter()
 
 
-def test_one_request_at_a_time_asks_for_one_chunk() -> None:
+def test_requests_cover_one_chunk_at_a_time() -> None:
     run = Run(Way(lost=set(range(20, 180))))
     most = 0
     answer = run.site.answer
@@ -240,7 +240,7 @@ def test_one_request_at_a_time_asks_for_one_chunk() -> None:
 
 def test_many_small_gaps_share_a_request() -> None:
     """Every second record is lost: one request for each would not catch up on a busy machine."""
-    lost = {place for place, (_, channel, n) in enumerate(SENT) if channel == "state" and n % 2}
+    lost = {index for index, (_, channel, n) in enumerate(SENT) if channel == "state" and n % 2}
     run = Run(Way(lost=lost))
     answer = run.site.answer
     run.site.answer = lambda: None  # type: ignore[method-assign]
@@ -251,10 +251,10 @@ def test_many_small_gaps_share_a_request() -> None:
     assert "missing 0" in run.desk.log().account("m")
 
 
-def test_a_gap_alone_is_asked_for_alone() -> None:
-    """Where little is lost, nothing comes twice."""
+def test_single_gaps_are_requested_alone() -> None:
+    """At low loss no message arrives twice."""
     lost = {
-        place for place, (_, channel, n) in enumerate(SENT) if channel == "state" and n == 50
+        index for index, (_, channel, n) in enumerate(SENT) if channel == "state" and n == 50
     }
     run = Run(Way(lost=lost))
     run.live(2600 * MS)
@@ -262,15 +262,15 @@ def test_a_gap_alone_is_asked_for_alone() -> None:
     assert [(wanted.first, wanted.last) for wanted in run.site.asked] == [(50, 50)]
 
 
-def test_a_silent_site_is_asked_and_its_lost_end_noticed() -> None:
+def test_silent_sites_are_asked_for_lost_ends() -> None:
     run = Run(Way(lost={n for n, (at_ns, _, _) in enumerate(SENT) if at_ns >= S}))
     run.live(3100 * MS)
     assert run.until_stored().text == "every record of m is stored"
     assert run.desk.recording.describe_problem() == "s disappeared after 0 records"
 
 
-def test_a_hushed_site_is_asked_three_times_a_second() -> None:
-    """It hangs, say: it has said nothing since its start, and there is nothing to be had."""
+def test_hushed_sites_are_asked_thrice_a_second() -> None:
+    """A site that hangs: it has sent nothing since its start, and has nothing to give."""
     run = Run(Way(lost=set(range(len(SENT)))))
     run.site.answer()
     for _ in range(500):
@@ -281,7 +281,7 @@ def test_a_hushed_site_is_asked_three_times_a_second() -> None:
 
 
 @pytest.mark.parametrize("how", ["lost", "garbage", "wrong boot"])
-def test_an_unanswering_site_is_asked_ever_more_rarely(how: str) -> None:
+def test_unanswering_sites_are_asked_ever_less(how: str) -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.site.replies = lambda payload: lie(how, payload)
     run.live(2100 * MS)
@@ -294,7 +294,7 @@ def test_an_unanswering_site_is_asked_ever_more_rarely(how: str) -> None:
     assert f"missing {TICKS - len(log['m'])}" in log.account("m")
 
 
-def test_a_site_that_answers_in_vain_is_left_alone() -> None:
+def test_sites_answering_in_vain_are_left_alone() -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.site.replies = lambda payload: lie("undecodable", payload)
     run.live(20 * S)
@@ -302,7 +302,7 @@ def test_a_site_that_answers_in_vain_is_left_alone() -> None:
     assert "missing for good" in run.until_stored().text
 
 
-def test_what_a_site_no_longer_has_is_asked_for_once() -> None:
+def test_forgotten_messages_are_asked_for_once() -> None:
     run = Run(Way(lost=set(range(200)), oldest={"state": TICKS, "link": 20, "event": 9}))
     run.live(2600 * MS)
     stored = run.until_stored()
@@ -311,7 +311,7 @@ def test_what_a_site_no_longer_has_is_asked_for_once() -> None:
     assert len(first) == len(set(first))
 
 
-def test_a_late_message_that_was_given_up_is_welcome() -> None:
+def test_late_messages_are_stored_after_giving_up() -> None:
     run = Run(Way(lost={0}, oldest={"state": 5}))
     run.live(2100 * MS)
     run.until_stored()
@@ -328,7 +328,7 @@ def vanish(run: Run) -> None:
         )
 
 
-def test_a_departed_site_is_not_asked_and_delays_no_end() -> None:
+def test_departed_sites_are_not_asked() -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.live(25 * MS)
     vanish(run)
@@ -338,8 +338,8 @@ def test_a_departed_site_is_not_asked_and_delays_no_end() -> None:
     assert run.desk.over()
 
 
-def test_site_that_goes_on_is_there_whatever_its_token_says() -> None:
-    """A connection that is made anew may tell that a token went and came in the wrong order."""
+def test_tokens_do_not_end_a_sending_site() -> None:
+    """A reconnection may report the departure and the return of a token in the wrong order."""
     run = Run(Way(lost=set(range(30, 60))))
     vanish(run)
     run.live(2100 * MS)
@@ -348,8 +348,8 @@ def test_site_that_goes_on_is_there_whatever_its_token_says() -> None:
     assert "missing 0" in run.desk.log().account("m")
 
 
-def test_site_that_goes_on_and_then_dies_ends_recording() -> None:
-    """Its token had disappeared before, and nothing will tell of it once more."""
+def test_sites_dying_after_a_return_end_recording() -> None:
+    """Their token had disappeared before, and will not be reported again."""
     run = Run(Way(lost=set(range(30, 60))))
     vanish(run)
     run.live(25 * MS)
@@ -361,14 +361,14 @@ def test_site_that_goes_on_and_then_dies_ends_recording() -> None:
     assert run.desk.over()
 
 
-def test_answers_that_are_too_large_for_way_are_made_smaller() -> None:
+def test_oversized_answers_become_smaller() -> None:
     run = Run(Way(lost=set(range(20, 180))))
     run.site.replies = lambda payload: [payload] if len(payload) < 5_000 else []
     run.live(2100 * MS)
     assert run.until_stored().text == "every record of m is stored"
 
 
-def test_a_channel_that_is_never_answered_keeps_no_other_waiting() -> None:
+def test_unanswered_channels_delay_no_other() -> None:
     run = Run(Way(lost={n for n in range(20, 180) if n % 3}))
     run.site.replies = lambda payload: (
         [] if decode(payload, Backfill).channel == "state" else [payload]
@@ -382,7 +382,7 @@ def test_a_channel_that_is_never_answered_keeps_no_other_waiting() -> None:
     assert run.desk.said() == []
 
 
-def test_times_come_from_monotonic_clock_however_wall_clock_steps() -> None:
+def test_times_come_from_the_monotonic_clock() -> None:
     class Stepping(ManualClock):
         def unix_ns(self) -> int:
             return super().unix_ns() + (-3600 * S if self.monotonic_ns() > MONO_NS + S else 0)

@@ -1,4 +1,4 @@
-"""Messages are stamped where they come in; the queue is bounded and what overflows is counted."""
+"""Messages are stamped on arrival; the queue is bounded and losses are counted."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from recorder.site_reception import InboundQueue
 from tests.net.manual_clock import ManualClock
 
 
-def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:
+def test_stamped_messages_come_out_oldest_first() -> None:
     clock = ManualClock(100)
     tap = InboundQueue(clock)
     tap.receive("a", b"1")
@@ -20,7 +20,7 @@ def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:
     assert list(messages) == [("b", b"2", 250), ("c", b"3", 900)]
 
 
-def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_queues_count_their_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CAPACITY", 5)
     tap = InboundQueue(ManualClock())
     for n in range(8):
@@ -32,7 +32,7 @@ def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> N
     assert tap.overflowed == {"a": 3}
 
 
-def test_a_flood_of_one_key_leaves_room_for_the_others(
+def test_a_flood_leaves_room_for_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "KEY_BYTES", 5_000)

@@ -1,4 +1,4 @@
-"""A recorder that comes into a running session has what the sites remember, and says that it came late."""
+"""A recorder that joins a running session gets the remembered messages, and reports its lateness."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from .desk import BOOTS, SESSION, TICKS, Desk, Memory, S, end, happening, states
 
 
 def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
-    """A recorder that comes 40 s late into a session of which these sites are left."""
+    """Returns a recorder that comes 40 s late into a session in which these sites remain."""
     desk = Desk()
     sites = {name: Memory(desk.network, name) for name in there}
     for name, site in sites.items():
@@ -36,7 +36,7 @@ def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
     return desk, sites
 
 
-def test_it_asks_every_site_for_all_that_it_has() -> None:
+def test_late_recorders_ask_for_everything() -> None:
     desk, sites = late_desk("m", "s")
     desk.rounds(30, *sites.values())
     said = desk.said()
@@ -58,7 +58,7 @@ def test_it_asks_every_site_for_all_that_it_has() -> None:
     ]
 
 
-def test_sites_that_are_gone_are_named_and_not_waited_for() -> None:
+def test_missing_sites_are_named_without_waiting() -> None:
     desk, sites = late_desk("m")
     desk.rounds(30, *sites.values())
     assert [(event.kind, event.about) for event in desk.said()] == [
@@ -72,7 +72,7 @@ def test_sites_that_are_gone_are_named_and_not_waited_for() -> None:
     assert desk.recording.describe_problem() == "s disappeared after 0 records"
 
 
-def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
+def test_forgotten_messages_stay_missing() -> None:
     desk, sites = late_desk("m", "s")
     for site in sites.values():
         site.oldest["state"] = 20
@@ -86,7 +86,7 @@ def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 5 * S])
-def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int) -> None:
+def test_recorders_take_over_from_ended_ones(tmp_path: Path, ahead_ns: int) -> None:
     """Real sites, real recorders, in one process; the second one with another clock, too."""
     scenario = load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 100})
     session = Session(scenario, tmp_path / "first.mcap")
@@ -99,11 +99,11 @@ def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int
     later = tmp_path / "later.mcap"
 
     def second(clock: RelayClock) -> str | None:
-        own = session._own("later", clock)
+        late_recorder = session._own("later", clock)
         said = session.said.append
         recorder = Recorder(
             session.network.join(),
-            own,
+            late_recorder,
             REAL,
             99,
             LogStorage(later),
@@ -122,7 +122,7 @@ def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int
     log = open_log(later)
     assert in_log(log) == in_virtual_time(scenario)
     assert verify(log).whole_run
-    (came,) = [event for event in log.events if event.kind == "late"]
-    assert 0 < came.t_ns < 3 * S
+    (late_event,) = [event for event in log.events if event.kind == "late"]
+    assert 0 < late_event.t_ns < 3 * S
     assert any("joins the session" in sentence for sentence in session.said)
     assert 0 < len(open_log(tmp_path / "first.mcap")["m"]) < scenario.ticks("m")

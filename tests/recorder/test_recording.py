@@ -1,4 +1,4 @@
-"""What the recorder writes, what it refuses and counts, and what it knows is missing."""
+"""The output of the recorder: stored, refused and counted messages, and known losses."""
 
 import io
 from pathlib import Path
@@ -36,11 +36,11 @@ from .desk import (
     UNIX_NS,
     Desk,
     Memory,
+    answer_info,
     end,
     happening,
     states,
     statistics,
-    told,
 )
 
 
@@ -80,7 +80,7 @@ REFUSED = {
 @pytest.mark.parametrize(
     ("reason", "name", "channel", "payload"), REFUSED.values(), ids=REFUSED.keys()
 )
-def test_foreign_messages_are_dropped_the_rest_written_byte_for_byte(
+def test_foreign_messages_are_dropped_and_others_kept(
     reason: str, name: str, channel: str, payload: bytes
 ) -> None:
     desk = Desk()
@@ -133,10 +133,8 @@ def ahead(tick: int) -> bytes:
         "the number of an event",
     ],
 )
-def test_member_that_says_more_than_clock_allows_is_not_believed(
-    reason: str, channel: str, payload: bytes
-) -> None:
-    """It has valid keys and says that it made 50 s of records after some milliseconds."""
+def test_claims_beyond_the_clock_are_refused(reason: str, channel: str, payload: bytes) -> None:
+    """The member has valid keys and claims 50 s of records after some milliseconds."""
     desk = Desk(LONG)
     records = states("m")
     desk.take("m", topics.STATE, *records[:10])
@@ -154,7 +152,7 @@ def test_member_that_says_more_than_clock_allows_is_not_believed(
     )
 
 
-def test_answer_for_more_than_clock_allows_is_not_believed() -> None:
+def test_answers_beyond_the_clock_are_refused() -> None:
     desk = Desk(LONG)
     memory = Memory(desk.network, "m")
     memory.made["state"] = [b""] * 50_000
@@ -165,7 +163,7 @@ def test_answer_for_more_than_clock_allows_is_not_believed() -> None:
     assert account.expected <= 2_000 + 60 * 10 + 10
 
 
-def test_clocks_may_differ_by_what_clocks_differ() -> None:
+def test_clocks_may_differ_within_tolerance() -> None:
     """Two seconds, and a thousandth of the time."""
     desk = Desk(LONG)
     desk.wait(40 * 1_000_000_000)
@@ -175,7 +173,7 @@ def test_clocks_may_differ_by_what_clocks_differ() -> None:
 
 @pytest.mark.parametrize("t_ns", [-(2**63), 2**64 - 1])
 @pytest.mark.parametrize("kind", ["state", "link", "event"])
-def test_no_time_stamp_of_any_size_ends_the_recording(kind: str, t_ns: int) -> None:
+def test_no_time_stamp_ends_the_recording(kind: str, t_ns: int) -> None:
     desk = Desk()
     message = {"state": states("m")[0], "link": statistics("m"), "event": end("m")}[kind]
     fields = msgpack.unpackb(message)
@@ -184,7 +182,7 @@ def test_no_time_stamp_of_any_size_ends_the_recording(kind: str, t_ns: int) -> N
     assert len(desk.log()["s"]) == TICKS
 
 
-def test_gaps_are_counted_named_and_a_problem() -> None:
+def test_gaps_are_counted_and_named_problems() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:10], *records[13:30], *records[31:-2])
@@ -204,7 +202,7 @@ def test_gaps_are_counted_named_and_a_problem() -> None:
     )
 
 
-def test_overflow_is_counted_in_the_file_and_in_the_summary(
+def test_overflow_is_counted_in_file_and_summary(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tap_module, "CAPACITY", 20)
@@ -220,8 +218,8 @@ def test_overflow_is_counted_in_the_file_and_in_the_summary(
     )
 
 
-def test_flood_of_events_leaves_log_that_can_be_used() -> None:
-    """What packs to nothing in the file must not take the reader's memory, nor the place of an end."""
+def test_floods_of_events_leave_usable_logs() -> None:
+    """Highly compressible messages must not take the reader's memory, nor the room of the end."""
     desk = Desk()
     desk.take("m", topics.STATE, *states("m"))
     desk.take("m", topics.LINK, statistics("m"))
@@ -237,7 +235,7 @@ def test_flood_of_events_leaves_log_that_can_be_used() -> None:
     assert "missing" in (desk.recording.describe_problem() or "")
 
 
-def test_stored_is_said_only_when_every_record_is_in() -> None:
+def test_stored_means_every_record_is_stored() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:-1])
@@ -251,15 +249,15 @@ def test_stored_is_said_only_when_every_record_is_in() -> None:
     desk.write()
     assert desk.stored() == []
     assert [e.about for e in desk.log().events if e.kind == "stored"] == ["m"]
-    own = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
-    assert (own.expected, own.received) == (1, 1)
+    account = desk.recording.accounts[topics.key(SESSION, topics.RECORDER, topics.EVENT)]
+    assert (account.expected, account.received) == (1, 1)
 
 
 def alive(name: str, boot: int | str) -> str:
     return topics.key(SESSION, name, topics.ALIVE) + f"/{boot}"
 
 
-def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
+def test_dying_sites_end_recording_and_are_named() -> None:
     desk = Desk()
     desk.whole("m")
     desk.take("s", topics.STATE, *states("s")[:20])
@@ -279,8 +277,8 @@ def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
 @pytest.mark.parametrize(
     ("said_its_end", "patience_ns"), [(True, RECONNECT_NS), (False, AWAY_NS)]
 )
-def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
-    """Even if it is the recorder that is cut off: then all sites are gone at once."""
+def test_long_cut_off_sites_are_awaited(said_its_end: bool, patience_ns: int) -> None:
+    """Even if the recorder itself is cut off: then all sites disappear at once."""
     desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))
     if said_its_end:
         for name in ("m", "s"):
@@ -302,7 +300,7 @@ def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: 
 @pytest.mark.parametrize(
     "key", [alive("s", 99), alive("s", "x"), alive("nobody", 1), "trilat", "", "a/b"]
 )
-def test_tokens_of_others_end_nothing(key: str) -> None:
+def test_foreign_tokens_end_nothing(key: str) -> None:
     desk = Desk()
     desk.whole("m")
     desk.recording.note_presence(key, False)
@@ -312,7 +310,7 @@ def test_tokens_of_others_end_nothing(key: str) -> None:
     assert not desk.over()
 
 
-def test_a_crash_leaves_all_that_was_flushed() -> None:
+def test_a_crash_keeps_flushed_data() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:30])
@@ -325,7 +323,7 @@ def test_a_crash_leaves_all_that_was_flushed() -> None:
     assert verify(log).agreed
 
 
-def test_what_still_waits_at_the_end_is_written() -> None:
+def test_waiting_messages_are_written_at_the_end() -> None:
     desk = Desk()
     for payload in states("m"):
         desk.tap.receive(topics.key(SESSION, "m", topics.STATE), payload)
@@ -338,7 +336,7 @@ def test_what_still_waits_at_the_end_is_written() -> None:
 def start_recorder(
     network: LocalNetwork, clock: RelayClock, folder: Path, stop_ns: int
 ) -> Recorder:
-    """A recorder that has met site m, and is asked to stop at a time."""
+    """Returns a recorder that has met site m, and is asked to stop at a time."""
     recorder = Recorder(
         bus=network.join(),
         clock=clock,
@@ -350,18 +348,22 @@ def start_recorder(
         stopped=lambda: clock.monotonic_ns() > stop_ns,
         say=str,
     )
-    recorder._joining.membership.others["m"] = told("m")
+    recorder._joining.membership.others["m"] = answer_info("m")
     return recorder
 
 
 def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
-    """A recorder whose session begins, and whose sites then say nothing; it is asked to stop at a time."""
+    """Returns a recorder whose session begins, and whose sites then are silent; it is asked to
+    stop at a time.
+    """
     network = LocalNetwork()
 
     def run(clock: RelayClock) -> None:
         recorder = start_recorder(network, clock, folder, stop_ns)
         met = recorder._joining.membership.others
-        stranger = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")
+        stranger = msgspec.structs.replace(
+            answer_info("m"), member="x", boot=5, scenario="garbage"
+        )
         recorder._joining.membership.others = {"x": stranger, **met}
         recorder.record(EPOCH)
 
@@ -376,7 +378,7 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
     relay.run()
 
 
-def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> None:
+def test_stopped_recorders_finish_their_file(tmp_path: Path) -> None:
     recorder_alone(tmp_path, Relay(), MONO_NS + 150_500_000)
     log = open_log(tmp_path / "run.mcap")
     assert log.complete
@@ -384,8 +386,8 @@ def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> N
     assert verify(log).agreed
 
 
-def test_a_recorder_that_was_behind_catches_up(tmp_path: Path) -> None:
-    """It asks again as soon as an answer is there, and not only when it writes to the file."""
+def test_lagging_recorders_catch_up(tmp_path: Path) -> None:
+    """The next request follows an answer at once, before the next write to the file."""
     network, relay = LocalNetwork(), Relay()
     ended_ns = MONO_NS + 50 * MS
     grace_ns, answer_ns = 50 * MS, 2 * POLL_NS
@@ -411,13 +413,13 @@ def test_a_recorder_that_was_behind_catches_up(tmp_path: Path) -> None:
     assert len(open_log(tmp_path / "run.mcap")["m"]) == TICKS
 
 
-def test_scenario_is_that_of_member_and_not_of_stranger(tmp_path: Path) -> None:
+def test_scenarios_come_from_members_only(tmp_path: Path) -> None:
     recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
     assert open_log(tmp_path / "run.mcap").scenario.sha256 == SCENARIO.sha256
 
 
-def test_a_recorder_that_ends_waits_for_what_sites_hold() -> None:
-    """Of a site that goes on it waits only until nothing is missing."""
+def test_ending_recorders_wait_for_held_records() -> None:
+    """For a running site only until no record is missing."""
     desk = Desk()
     ending_ns = desk.clock.monotonic_ns()
     desk.whole("m")
@@ -429,7 +431,7 @@ def test_a_recorder_that_ends_waits_for_what_sites_hold() -> None:
     assert desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
 
 
-def test_a_silent_site_without_an_end_may_still_hold_records() -> None:
+def test_silent_sites_may_still_hold_records() -> None:
     desk = Desk()
     desk.whole("m")
     desk.take("s", topics.STATE, *states("s")[:20])

@@ -1,4 +1,4 @@
-"""What a recorder says of its own work: true, once a second, bounded, and in its log."""
+"""A recorder's report on its own work: true, once a second, bounded, and in its log."""
 
 from recorder.session_recording import REPORT_EVERY_NS
 from trilat_net.net import topics
@@ -9,11 +9,11 @@ from trilat_net.scenario import load_scenario
 from .desk import MS, SESSION, Desk, S, states
 
 
-def heard(desk: Desk) -> list[RecorderStats]:
+def read_reports(desk: Desk) -> list[RecorderStats]:
     return [decode(message[1], RecorderStats) for message in iter(desk.reports.poll, None)]
 
 
-def test_it_says_what_is_there_and_what_is_missing() -> None:
+def test_reports_give_stored_and_missing_records() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:10], *records[13:30], records[29], records[12])
@@ -22,7 +22,7 @@ def test_it_says_what_is_there_and_what_is_missing() -> None:
     desk.report.note_flush(2 * MS)
     desk.tap.receive("somewhere", b"")
     desk.report.publish()
-    (stats,) = heard(desk)
+    (stats,) = read_reports(desk)
     assert stats.queued == 1
     assert (stats.expected["m/state"], stats.received["m/state"]) == (30, 28)
     assert (stats.missing["m/state"], stats.gaps) == (2, {"m/state": ["10-11"]})
@@ -37,16 +37,16 @@ def test_it_says_what_is_there_and_what_is_missing() -> None:
         *("recorder/event", "recorder/stats"),
     }
     desk.report.publish()
-    assert heard(desk)[0].flush_max_us == 0
+    assert read_reports(desk)[0].flush_max_us == 0
 
 
-def test_it_says_so_once_a_second_and_writes_it() -> None:
+def test_reports_come_once_a_second_in_logs() -> None:
     desk = Desk()
     for _ in range(350):
         desk.wait(10 * MS)
         desk.write()
         desk.report.poll()
-    said = heard(desk)
+    said = read_reports(desk)
     assert [stats.t_ns for stats in said] == [
         REPORT_EVERY_NS,
         2 * REPORT_EVERY_NS,
@@ -55,16 +55,16 @@ def test_it_says_so_once_a_second_and_writes_it() -> None:
     assert desk.written()["recorder/stats"] == [encode(stats) for stats in said]
 
 
-def test_a_recorder_that_slept_does_not_make_up_for_it() -> None:
+def test_sleeping_recorders_skip_reports() -> None:
     desk = Desk()
     desk.wait(10 * S + 300 * MS)
     for _ in range(160):
         desk.report.poll()
         desk.wait(10 * MS)
-    assert [stats.t_ns // MS for stats in heard(desk)] == [10_300, 11_300]
+    assert [stats.t_ns // MS for stats in read_reports(desk)] == [10_300, 11_300]
 
 
-def test_it_fits_a_message_however_much_is_missing() -> None:
+def test_reports_always_fit_a_message() -> None:
     desk = Desk(load_scenario("two_sites"))
     for key in desk.recording.accounts:
         for number in range(0, 10_000, 2):
@@ -75,6 +75,6 @@ def test_it_fits_a_message_however_much_is_missing() -> None:
             key
         ]
     desk.report.publish()
-    (stats,) = heard(desk)
+    (stats,) = read_reports(desk)
     assert sum(map(len, stats.gaps.values())) <= 600
     assert len(encode(stats)) < MAX_BYTES

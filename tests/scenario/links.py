@@ -1,4 +1,4 @@
-"""Links as an author may write them: every model, everything that it may have besides."""
+"""Links as an author may write them: every model, with every optional key."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ share = st.floats(0.0, 1.0)
 
 @st.composite
 def _losses(draw: st.DrawFn) -> dict[str, Any]:
-    """Loss that a chain of two states can give."""
+    """Draws losses that a chain of two states can have."""
     if draw(st.booleans()):
         return draw(st.fixed_dictionaries({}, optional={"loss": share}))
     bad = draw(st.floats(0.3, 1.0))

@@ -9,8 +9,8 @@ RTT_NS = (17291970, 16870863, 16064572, 16259053, 16597560)
 SENT_NS = (22211105, 1022856655, 2022029432, 3022256680, 4022643932)
 
 
-def trip(number: int, lost: str = "false") -> dict[str, Any]:
-    """An entry of the file; `lost` is what irtt says of that."""
+def make_round_trip(number: int, lost: str = "false") -> dict[str, Any]:
+    """Returns an entry of the file; `lost` is irtt's word for the loss."""
     times = {"client": {"send": {"wall": 1707277440772833721, "monotonic": SENT_NS[number]}}}
     delay = (
         {}
@@ -21,7 +21,7 @@ def trip(number: int, lost: str = "false") -> dict[str, Any]:
 
 
 def irtt(folder: Path, *lost: int, zipped: bool = False) -> Path:
-    trips = [trip(n, "true_up" if n in lost else "false") for n in range(5)]
+    trips = [make_round_trip(n, "true_up" if n in lost else "false") for n in range(5)]
     text = json.dumps({"stats": {}, "round_trips": trips}).encode()
     path = folder / ("run.json.gz" if zipped else "run.json")
     path.write_bytes(gzip.compress(text) if zipped else text)

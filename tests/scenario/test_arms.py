@@ -1,4 +1,4 @@
-"""Arms in scenarios: what a chain's tables may say, what is refused and where, and that its text is whole."""
+"""Arms in scenarios: valid tables of a chain, refusals with their place, and a complete text."""
 
 import math
 from pathlib import Path
@@ -59,7 +59,7 @@ def refusal(changes: Overrides) -> ScenarioError:
 
 
 @pytest.mark.long
-def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
+def test_shipped_arms_have_their_makers_data() -> None:
     """UR5: table C.3 of its manual, less than 18 kg with the base; Panda: 0.855 m and about 18 kg."""
     ur5, panda = (load_scenario(name).arms["s"] for name in ("six_joints", "seven_joints"))
     assert ur5.theta[::10].sum() == pytest.approx(17.05, abs=0.005)
@@ -82,7 +82,7 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("changes", "path", "phrase"),
     [
         (
             {"arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.1]},
@@ -184,13 +184,13 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
         ),
     ],
 )
-def test_a_mistake_is_refused_at_its_own_key(changes: Overrides, path: str, words: str) -> None:
+def test_mistakes_are_refused_at_their_key(changes: Overrides, path: str, phrase: str) -> None:
     error = refusal(changes)
-    assert (error.path, words in error.problem) == (f"sites.m1.{path}", True), error
+    assert (error.path, phrase in error.problem) == (f"sites.m1.{path}", True), error
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("changes", "path", "phrase"),
     [
         ({"arm.urdf": "nope.urdf"}, "arm.urdf", "nope.urdf cannot be read: No such file"),
         ({"arm.urdf": 5}, "arm.urdf", "file's name"),
@@ -204,13 +204,15 @@ def test_a_mistake_is_refused_at_its_own_key(changes: Overrides, path: str, word
         ),
     ],
 )
-def test_a_mistake_of_the_whole_scenario_too(changes: Overrides, path: str, words: str) -> None:
+def test_mistakes_of_whole_scenarios_are_refused(
+    changes: Overrides, path: str, phrase: str
+) -> None:
     error = refusal(changes)
-    assert (error.path, words in error.problem) == (path, True), error
+    assert (error.path, phrase in error.problem) == (path, True), error
 
 
 @pytest.mark.parametrize("key", ["armature_kg_m2", "payload_kg", "stops", "down", "tip"])
-def test_a_planar_arm_has_no_keys_of_a_chain(key: str) -> None:
+def test_planar_arms_have_no_chain_keys(key: str) -> None:
     value: Any = {"stops": False, "down": [0.0, -1.0, 0.0], "tip": "x"}.get(key, 1.0)
     with pytest.raises(
         ScenarioError, match=f"sites.m1.arm.{key}: belongs to an arm with a urdf"
@@ -218,7 +220,7 @@ def test_a_planar_arm_has_no_keys_of_a_chain(key: str) -> None:
         load_scenario("free", {f"arm.{key}": value})
 
 
-def test_arms_of_unlike_joints_are_refused_in_joint_space() -> None:
+def test_unlike_joints_are_refused_in_joint_space() -> None:
     error = refusal(
         {
             "sites.s.arm.urdf": "arm7.urdf",
@@ -230,7 +232,7 @@ def test_arms_of_unlike_joints_are_refused_in_joint_space() -> None:
     assert "has 7 joints, but the arm of m1 has 6" in error.problem
 
 
-def test_a_link_of_meshes_alone_is_refused_with_its_name() -> None:
+def test_links_of_meshes_alone_are_refused() -> None:
     start, end = ARM6.index("<inertial>"), ARM6.index("</inertial>") + len("</inertial>")
     mesh = '<visual><geometry><mesh filename="shoulder.dae"/></geometry></visual>'
     error = refusal({"urdf": {"arm6.urdf": ARM6[:start] + mesh + ARM6[end:]}})
@@ -242,9 +244,7 @@ def test_a_link_of_meshes_alone_is_refused_with_its_name() -> None:
 
 
 @pytest.mark.parametrize(("scheme", "most"), [("second_order", 1.0), ("digital", 2.0)])
-def test_damping_that_a_light_joint_cannot_take_names_the_joint(
-    scheme: str, most: float
-) -> None:
+def test_excessive_damping_of_a_joint_is_named(scheme: str, most: float) -> None:
     """The largest eigenvalue of h D M^-1 by NumPy, from Pinocchio's M of a stored pose."""
     chain, states = chain_references()["arm6"]
     pose, armature = states[0].q, np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
@@ -262,31 +262,31 @@ def test_damping_that_a_light_joint_cannot_take_names_the_joint(
 # What is accepted
 
 
-def test_one_number_stands_for_every_joint_each_drawn_by_itself() -> None:
+def test_one_number_applies_to_every_joint() -> None:
     same = six(**{"arm.armature_kg_m2": 0.1, "limits.tau_limit_nm": 50.0})
     assert same.sites["s"].arm.armature_kg_m2 == (0.1,) * 6
     drawn = six(**{"arm.armature_kg_m2": UNIFORM, "arm.payload_kg": UNIFORM})
-    found = {*drawn.sites["m1"].arm.armature_kg_m2, *drawn.sites["s"].arm.armature_kg_m2}
-    assert len(found) == 12
-    assert all(0.1 <= one <= 0.2 for one in found)
+    inertias = {*drawn.sites["m1"].arm.armature_kg_m2, *drawn.sites["s"].arm.armature_kg_m2}
+    assert len(inertias) == 12
+    assert all(0.1 <= inertia <= 0.2 for inertia in inertias)
     assert drawn.arms["m1"].theta[50] != drawn.arms["s"].theta[50]  # mass of the last link
     again = reseed_scenario(drawn, 2)
     assert again.sites["s"].arm.payload_kg != drawn.sites["s"].arm.payload_kg
-    assert not found & {*again.sites["s"].arm.armature_kg_m2}
+    assert not inertias & {*again.sites["s"].arm.armature_kg_m2}
     assert reseed_scenario(again, 1) == drawn
 
 
-def test_drawn_start_pose_takes_operator_at_end_effector_along() -> None:
+def test_drawn_start_poses_move_tip_operators() -> None:
     start = [0.3, {"uniform": [-1.2, -0.8]}, 1.2, -0.6, 0.5, 0.2]
     drawn = six(**{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]})
     again = reseed_scenario(drawn, 2)
-    for one in (drawn, again):
-        spec = one.sites["m1"]
-        assert list(spec.hands[0].from_m) == one.arms["m1"].end_effector(spec.q0_rad)
+    for scenario_drawn in (drawn, again):
+        spec = scenario_drawn.sites["m1"]
+        assert list(spec.hands[0].from_m) == scenario_drawn.arms["m1"].end_effector(spec.q0_rad)
     assert drawn.sites["m1"].hands[0].from_m != again.sites["m1"].hands[0].from_m
 
 
-def test_limits_are_those_of_file_unless_author_says_others() -> None:
+def test_limits_come_from_file_or_author() -> None:
     limits = six().sites["s"].limits
     assert limits.tau_limit_nm == (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
     assert limits.qd_limit_rad_s == (math.pi,) * 6
@@ -294,12 +294,12 @@ def test_limits_are_those_of_file_unless_author_says_others() -> None:
     assert (changed.tau_limit_nm, changed.qd_limit_rad_s) == (limits.tau_limit_nm, 5.0)
 
 
-def test_start_beyond_limits_is_free_where_there_are_no_stops() -> None:
+def test_start_beyond_limits_needs_no_stops() -> None:
     six(**{"sites.s.arm.stops": False, "sites.s.q0_rad": [7.0, 0, 0, 0, 0, 0]})
 
 
-def test_an_arm_may_start_a_little_beyond_a_stop() -> None:
-    """No spring pushes where it starts, the stop of other sites stays, and farther away it is refused."""
+def test_arms_may_start_slightly_beyond_stops() -> None:
+    """No spring pushes at the start pose, the stop of other sites stays, and larger excess is refused."""
     start = [6.34, -0.3, 0.5, 0.0, 0.0, 0.0]
     scenario = six(**{"sites.s.q0_rad": start})
     m1, s = (scenario.arms[name].chain.joints[0] for name in ("m1", "s"))
@@ -314,8 +314,10 @@ def test_an_arm_may_start_a_little_beyond_a_stop() -> None:
     assert "start at most 0.15 rad beyond" in error.problem
 
 
-def test_an_arm_beyond_its_stop_moves_back_inside() -> None:
-    """It begins at rest, and its peers, who stand within, lead it there; the run repeats bit for bit."""
+def test_an_arm_beyond_its_stop_moves_inside() -> None:
+    """The arm begins at rest, and its peers, which stand within, lead it there; the run repeats
+    bit for bit.
+    """
     scenario = load_scenario(two_joints(q0_rad=[2.1, 0.0]))
     log = trilat_net.simulate(scenario)
     m = log["m"]
@@ -327,7 +329,7 @@ def test_an_arm_beyond_its_stop_moves_back_inside() -> None:
     assert verify(log).passed
 
 
-def test_limits_of_position_give_way_to_a_start_a_little_beyond() -> None:
+def test_position_limits_yield_to_nearby_starts() -> None:
     limits = {"limits.q_max_rad": 2.0, "limits.q_min_rad": -2.0, "on_stale.action": "glide"}
     scenario = load_scenario("play", {**limits, "sites.m1.q0_rad": [2.1, 0.5]})
     assert scenario.setup("m1").limits.q_max == (2.15, 2.0)
@@ -340,25 +342,29 @@ def test_limits_of_position_give_way_to_a_start_a_little_beyond() -> None:
         load_scenario("play", {**limits, "sites.m1.q0_rad": [2.16, 0.5]})
 
 
-def test_gravity_along_axis_or_across_it_is_only_its_direction() -> None:
+def test_gravity_along_an_axis_is_a_direction() -> None:
     """down = -z at 9.81 is the default; its length does not matter, its bits do not depend on a library."""
     assert six(**{"arm.down": [0, 0, -3.0]}).arms["s"].chain.gravity_m_s2 == (0.0, 0.0, -9.81)
     x, y, z = six(**{"arm.down": [1.0, 2.0, -2.0]}).arms["s"].chain.gravity_m_s2
     assert (x, y, z) == pytest.approx((3.27, 6.54, -6.54), rel=1e-15)
 
 
-def test_an_arm_of_its_own_begins_anew() -> None:
-    """Nothing of [arm] holds for a site that names a file: tip and drives belong to the one of the group."""
-    own = {"arm": {"urdf": "arm7.urdf", "tip": "link6"}, "control": {"Kp": 0.01, "Kd": 0.0}}
+def test_a_sites_own_file_replaces_groups() -> None:
+    """No key of [arm] holds for a site that names a file: tip and drives belong to the arm of the group."""
+    own_keys = {
+        "arm": {"urdf": "arm7.urdf", "tip": "link6"},
+        "control": {"Kp": 0.01, "Kd": 0.0},
+    }
     start = [0, 0, 0, -1.5, 0, 1.5]
-    one = six(
-        **{f"sites.s.{key}": value for key, value in own.items()}, **{"sites.s.q0_rad": start}
+    tables = six(
+        **{f"sites.s.{key}": value for key, value in own_keys.items()},
+        **{"sites.s.q0_rad": start},
     )
-    assert one.sites["s"].arm.armature_kg_m2 == (0.0,)
-    assert one.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))
-    assert set(one.urdf) == {"arm6.urdf", "arm7.urdf"}
+    assert tables.sites["s"].arm.armature_kg_m2 == (0.0,)
+    assert tables.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))
+    assert set(tables.urdf) == {"arm6.urdf", "arm7.urdf"}
     back = load_scenario(
-        one, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1}
+        tables, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1}
     )
     assert (back.sites["s"].arm.tip, set(back.urdf)) == ("", {"arm6.urdf"})
 
@@ -378,7 +384,7 @@ def test_overrides_reach_every_arm_or_one() -> None:
 # Texts
 
 
-def test_an_embedded_text_is_whole_and_names_no_file() -> None:
+def test_embedded_texts_are_whole_without_files() -> None:
     scenario = six()
     assert parse_embedded(scenario.text) == scenario
     with pytest.raises(ScenarioError, match=r"arm.urdf: no file may be named here"):
@@ -388,7 +394,7 @@ def test_an_embedded_text_is_whole_and_names_no_file() -> None:
         six(**long)
 
 
-def test_a_text_that_no_arm_names_is_left_out() -> None:
+def test_unnamed_texts_are_left_out() -> None:
     assert six(urdf={"arm6.urdf": ARM6, "other.urdf": "x"}) == six()
 
 
@@ -453,8 +459,8 @@ def test_the_canonical_text_loads_to_the_same_scenario(
         assert (one.chain, one.gains, one.q0) == (other.chain, other.gains, other.q0)
 
 
-def test_end_effector_and_inertia_are_those_of_references() -> None:
-    """Pinocchio's, stored; the drives' inertia comes on top."""
+def test_tip_and_inertia_equal_the_references() -> None:
+    """Pinocchio's, stored; the drives' inertia is added."""
     model = six().arms["m1"]
     _, states = chain_references()["arm6"]
     for state in states:
@@ -463,7 +469,7 @@ def test_end_effector_and_inertia_are_those_of_references() -> None:
         assert np.abs(model.inertia(state.q) - expected).max() < 1e-12
 
 
-def test_a_planar_arm_beside_a_chain_is_the_same_arm() -> None:
+def test_planar_arms_equal_their_chain() -> None:
     """End effector of the chain of two joints against the cosines of the planar one."""
     two = read_urdf(ARM7, base="link2", tip="link4")
     assert len(two.joints) == 2
@@ -510,11 +516,11 @@ REACHES = {
 @pytest.mark.parametrize("name", REACHES)
 @given(turns=st.lists(st.floats(-1.0, 1.0), min_size=7, max_size=7))
 @settings(max_examples=40)
-def test_no_pose_leaves_the_reach_of_an_arm(name: str, turns: list[float]) -> None:
+def test_no_pose_exceeds_the_reach(name: str, turns: list[float]) -> None:
     arm = REACHES[name]
     q = [math.pi * turn for turn in turns[: arm.counts.joints]]
-    place = arm.end_effector(q)
-    assert arm.reach.find_nearest(place) == pytest.approx(place, abs=1e-9)
+    tip = arm.end_effector(q)
+    assert arm.reach.find_nearest(tip) == pytest.approx(tip, abs=1e-9)
 
 
 def test_the_reach_of_two_links_is_exact() -> None:
@@ -526,7 +532,7 @@ def test_the_reach_of_two_links_is_exact() -> None:
         )
 
 
-def test_a_hand_at_the_joints_stays_between_stops_and_limits() -> None:
+def test_joint_hands_stay_between_stops_and_limits() -> None:
     arm = six().arms["s"]
     reach = arm.find_joint_reach(MotionLimits(q_min=(-1.0,), q_max=(7.0,)))
     assert reach.find_nearest([9.0] * 6) == (2.0 * math.pi,) * 6

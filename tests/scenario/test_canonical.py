@@ -1,4 +1,4 @@
-"""The canonical text of a scenario, over everything that a scenario may have."""
+"""The canonical text of a scenario, over every feature of a scenario."""
 
 from typing import Any
 
@@ -43,17 +43,19 @@ def rows(draw: st.DrawFn, site: str) -> dict[str, float]:
 @st.composite
 def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
     times = sorted(draw(st.lists(st.floats(0, 100) | st.integers(0, 100), max_size=4)))
-    made = []
+    changes_made = []
     for at_s in times:
         if draw(st.booleans()):
             to = draw(links(without=("trace",)))
             to.pop("outages_s", None)
-            made.append({"at_s": at_s, "link": draw(st.sampled_from(EVERY)), "to": to})
+            changes_made.append({"at_s": at_s, "link": draw(st.sampled_from(EVERY)), "to": to})
         else:
             site = draw(st.sampled_from(NAMES))
-            made.append({"at_s": at_s, "dominance": site, "to": draw(rows(site))})
-            made[-1] |= draw(st.fixed_dictionaries({}, optional={"ramp_s": st.floats(0, 10)}))
-    return made
+            changes_made.append({"at_s": at_s, "dominance": site, "to": draw(rows(site))})
+            changes_made[-1] |= draw(
+                st.fixed_dictionaries({}, optional={"ramp_s": st.floats(0, 10)})
+            )
+    return changes_made
 
 
 overrides = st.fixed_dictionaries(
@@ -103,7 +105,7 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_what_nobody_asked_for_is_not_in_the_text(name: str) -> None:
+def test_unrequested_features_are_not_in_the_text(name: str) -> None:
     """So the hash of an experiment does not change when another feature comes."""
     text = load_scenario("paper", {"expect": {}}).text
     assert not any(

@@ -7,7 +7,7 @@ import pytest
 
 import tests.own_laws
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario.class_arguments import check_arguments, make_own_instance
+from trilat_net.own_code.class_arguments import check_arguments, make_own_instance
 
 
 class Any1:
@@ -29,7 +29,7 @@ def refusal(kind: Any, **settings: Any) -> str:
     return str(refused.value)
 
 
-def test_an_unknown_argument_is_named_with_the_file_and_those_there_are() -> None:
+def test_unknown_arguments_are_named_with_known_ones() -> None:
     text = refusal(tests.own_laws.PD, k=3)
     assert "mine:Kind" in text
     assert "own_laws.py" in text
@@ -61,12 +61,12 @@ def test_wrong_arguments_are_refused(kind: Any, settings: Any, fact: str) -> Non
     ],
 )
 def test_right_arguments_reach_the_class(kind: Any, settings: Any) -> None:
-    made = make_own_instance(kind, "mine:Kind", "facts", settings, "sites.s.control")
-    assert made.settings[0] == "facts"
-    assert made.settings[1] == 1
+    instance = make_own_instance(kind, "mine:Kind", "facts", settings, "sites.s.control")
+    assert instance.settings[0] == "facts"
+    assert instance.settings[1] == 1
 
 
-def test_a_failure_inside_the_class_keeps_its_text() -> None:
+def test_failures_inside_the_class_keep_their_text() -> None:
     class Broken:
         def __init__(self, _facts: object) -> None:
             raise RuntimeError("no motor")

@@ -1,4 +1,4 @@
-"""Links as people write them: what each model states, and what cannot be is refused with its key."""
+"""Links as people write them: the statements of each model, and refusals with their key."""
 
 import math
 from typing import Any
@@ -18,8 +18,8 @@ from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase
 
 
 def link(keys: dict[str, Any]) -> LinkBase:
-    made: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
-    return made
+    loaded: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
+    return loaded
 
 
 def refused(keys: dict[str, Any]) -> ScenarioError:
@@ -30,15 +30,15 @@ def refused(keys: dict[str, Any]) -> ScenarioError:
 
 
 @given(keys=links())
-def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> None:
-    made = link(keys)
-    mean_ms, deviation_ms = made.moments()
-    if not made.measured and not math.isnan(mean_ms):
+def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
+    loaded = link(keys)
+    mean_ms, deviation_ms = loaded.moments()
+    if not loaded.measured and not math.isnan(mean_ms):
         assert 0.0 <= mean_ms <= MAX_DELAY_US / 1000
         assert 0.0 <= deviation_ms < math.inf
-    assert made.describe()
-    points = made.points
-    model = made.to_core_model()._replace(trace_count=0 if points is None else len(points))
+    assert loaded.describe()
+    points = loaded.points
+    model = loaded.to_core_model()._replace(trace_count=0 if points is None else len(points))
     fates: Ints = due(channel([model], points=points), 50)
     kept = fates[fates != LOST]
     assert (kept >= 0).all()
@@ -47,23 +47,23 @@ def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> Non
 @given(keys=links())
 def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
-    made = link(keys)
-    model = made.to_core_model()
+    loaded = link(keys)
+    model = loaded.to_core_model()
     assert all(
         0.0 <= p <= 1.0 + 1e-12
         for p in (model.loss_good, model.loss_bad, model.enter, model.leave)
     )
     bad = model.enter / (model.enter + model.leave)
     assert bad * model.loss_bad + (1 - bad) * model.loss_good == pytest.approx(
-        made.loss, abs=1e-12
+        loaded.loss, abs=1e-12
     )
-    if made.loss_burst and made.loss:
+    if loaded.loss_burst and loaded.loss:
         assert 1 / (1 - (1 - model.leave) * model.loss_bad) == pytest.approx(
-            made.loss_burst, rel=1e-9
+            loaded.loss_burst, rel=1e-9
         )
 
 
-def test_it_says_in_a_few_words_what_a_link_does() -> None:
+def test_links_are_described_in_few_words() -> None:
     keys = {
         "loss": 0.05,
         "loss_burst": 8,
@@ -71,10 +71,10 @@ def test_it_says_in_a_few_words_what_a_link_does() -> None:
         "outages_s": [[1, 2.5]],
         "order": "in_order",
     }
-    words = link(
+    description = link(
         {"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}
     ).describe()
-    assert words == (
+    assert description == (
         "gamma 40 +- 10 ms, loss 5 % in bursts of 8, duplicates 1 %, cut 1-2.5 s, in order, play-out 80 ms"
     )
     assert link({"model": "none"}).describe() == "no delay"
@@ -84,16 +84,16 @@ def test_it_says_in_a_few_words_what_a_link_does() -> None:
 
 def test_a_table_with_a_model_begins_anew() -> None:
     base = {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 50.0, "loss": 0.1}
-    own = {
+    tables = {
         "m1->s": {"half_width_ms": 5.0},
         "m2->s": {"model": "constant", "delay_ms": 7},
         "s->m1": {"preset": "5g"},
     }
-    made = load_scenario("paper", {"link": base, "links": own}).links
-    assert made["m1->s"].describe() == "uniform 100 +- 2.89 ms, loss 10 %"
-    assert made["m2->s"].describe() == "7 ms"
-    assert made["s->m1"].describe() == "hyperexponential 21.5 +- 29.1 ms"
-    assert made["s->m2"].describe() == "uniform 100 +- 28.9 ms, loss 10 %"
+    loaded = load_scenario("paper", {"link": base, "links": tables}).links
+    assert loaded["m1->s"].describe() == "uniform 100 +- 2.89 ms, loss 10 %"
+    assert loaded["m2->s"].describe() == "7 ms"
+    assert loaded["s->m1"].describe() == "hyperexponential 21.5 +- 29.1 ms"
+    assert loaded["s->m2"].describe() == "uniform 100 +- 28.9 ms, loss 10 %"
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_table_with_a_model_begins_anew() -> None:
         ({"model": "uniform", "delay_ms": 5, "half_width_ms": 1}, True, False),
     ],
 )
-def test_whether_anything_is_drawn_and_whether_the_network_decides(
+def test_randomness_and_network_dependence_are_known(
     keys: dict[str, Any], random: bool, measured: bool
 ) -> None:
     scenario = load_scenario("paper", {"link": keys})
@@ -123,7 +123,7 @@ def test_whether_anything_is_drawn_and_whether_the_network_decides(
 
 
 @pytest.mark.parametrize(
-    ("keys", "path", "words"),
+    ("keys", "path", "phrase"),
     [
         ({"model": "unifrom"}, "link.model", "did you mean 'uniform'"),
         ({"model": 3}, "link.model", "must be one of"),
@@ -150,10 +150,10 @@ def test_whether_anything_is_drawn_and_whether_the_network_decides(
         ({"model": "hyperexponential", "floor_ms": 5}, "fast_ms", "is missing"),
     ],
 )
-def test_what_a_link_does_not_know(keys: dict[str, Any], path: str, words: str) -> None:
+def test_links_do_not_accept_other_keys(keys: dict[str, Any], path: str, phrase: str) -> None:
     error = refused(keys)
     assert path in error.path
-    assert words in error.problem
+    assert phrase in error.problem
 
 
 @pytest.mark.parametrize(
@@ -192,14 +192,14 @@ def test_what_a_link_does_not_know(keys: dict[str, Any], path: str, words: str) 
         ({"delay_ms": 5, "loss": 0.5, "loss_bad": 0.5, "loss_burst": 1.5}, "loss"),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_with_its_key(keys: dict[str, Any], key: str) -> None:
+def test_invalid_values_are_refused_with_their_key(keys: dict[str, Any], key: str) -> None:
     error = refused(keys)
     assert error.path.endswith(key)
     assert error.path.startswith("link")
     assert error.problem
 
 
-def test_choices_are_named_where_one_is_wrong() -> None:
+def test_wrong_choices_name_the_valid_ones() -> None:
     assert refused({"delay_ms": 5, "order": "in order"}).problem == (
         "is 'in order', but must be 'newest' or 'in_order'"
     )
@@ -221,19 +221,19 @@ def test_the_longest_burst_that_holes_allow_is_named() -> None:
 def test_extreme_numbers_are_refused_or_have_moments(
     model: str, delay_ms: float, deviation_ms: float
 ) -> None:
-    """Nothing overflows, divides by zero, or takes the root of a negative number."""
+    """No overflow, division by zero, or root of a negative number."""
     keys = {"delay_ms": delay_ms, "deviation_ms": deviation_ms}
     if model == "ar1":
         keys["correlation"] = 0.5
     try:
-        made = msgspec.convert({"model": model, **keys}, DELAY_MODELS[model])
+        model_of_link = msgspec.convert({"model": model, **keys}, DELAY_MODELS[model])
     except msgspec.ValidationError:
         return
-    if made.find_problem() is None:
-        assert all(math.isfinite(number) and number >= 0 for number in made.moments())
-        assert made.to_core_model().kind in set(DelayKind)
-        assert due(channel([made.to_core_model()]), 3).min() >= 0
+    if model_of_link.find_problem() is None:
+        assert all(math.isfinite(number) and number >= 0 for number in model_of_link.moments())
+        assert model_of_link.to_core_model().kind in set(DelayKind)
+        assert due(channel([model_of_link.to_core_model()]), 3).min() >= 0
 
 
-def test_a_trace_may_reach_the_limit_whatever_its_deviation() -> None:
+def test_traces_may_reach_the_limit() -> None:
     assert link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None

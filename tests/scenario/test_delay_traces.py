@@ -1,4 +1,4 @@
-"""Traces from tables: what a person's file may look like, and what is no trace."""
+"""Traces from tables: accepted files, and refusals."""
 
 import math
 from pathlib import Path
@@ -37,7 +37,7 @@ TEXT = "0 41200, 1000 lost, 2500 0"
         "t_s,delay_ms\n17.000,41.2\n17.001,lost\n17.0025,0\n",  # times count from the first point
     ],
 )
-def test_tables_as_people_have_them(tmp_path: Path, content: str) -> None:
+def test_tables_from_people_are_read(tmp_path: Path, content: str) -> None:
     (tmp_path / "delays.csv").write_bytes(content.encode())
     text = read_trace(tmp_path / "delays.csv", "m1->s")
     assert text == TEXT
@@ -52,7 +52,7 @@ rows = st.lists(
 
 
 @given(rows=rows)
-def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]) -> None:
+def test_traces_keep_microseconds(rows: list[tuple[int, int]]) -> None:
     t_us = np.cumsum([gap for gap, _ in rows])
     delays = [delay for _, delay in rows]
     table = [
@@ -66,7 +66,7 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "phrase"),
     [
         ("", "has no points"),
         ("t_s,delay_ms\n# nothing\n", "has no points"),
@@ -82,8 +82,8 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
         ("O.0,41\n1,5\n", "line 1: must have the form"),  # a broken first line is no head
     ],
 )
-def test_what_is_no_trace_is_refused_where_it_is_wrong(
-    tmp_path: Path, content: str, words: str
+def test_invalid_traces_are_refused_with_place(
+    tmp_path: Path, content: str, phrase: str
 ) -> None:
     (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
     with pytest.raises(ScenarioError) as error:
@@ -91,25 +91,25 @@ def test_what_is_no_trace_is_refused_where_it_is_wrong(
             "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}}
         )
     assert error.value.path == "links.m1->s.file"
-    assert words in error.value.problem
+    assert phrase in error.value.problem
     assert "delays.csv" in error.value.problem
 
 
-def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "latin.csv").write_bytes(b"t_s,delay_ms # \xe4\n0,5\n")
     (tmp_path / "long.csv").write_text("0," + "5" * 200_000, encoding="utf-8")
-    for name, words in (
+    for name, reason in (
         ("none.csv", "cannot be read: No such file"),
         ("", "cannot be read: the path is a folder, not a file"),
         ("latin.csv", "can't decode"),
         ("long.csv", "field larger than field limit"),
         ("a\0b.csv", "null byte"),
     ):
-        with pytest.raises(ScenarioError, match=words):
+        with pytest.raises(ScenarioError, match=reason):
             read_trace(tmp_path / name, "m1->s")
 
 
-def test_a_trace_that_is_too_long_is_refused() -> None:
+def test_overlong_traces_are_refused() -> None:
     with pytest.raises(ValueError, match="has 200001 points, but at most 200000"):
         format_trace([(n / 1000, 5.0) for n in range(MAX_TRACE_POINTS + 1)])
 
@@ -130,7 +130,7 @@ def test_a_trace_that_is_too_long_is_refused() -> None:
         "0 5, ",
     ],
 )
-def test_a_text_that_is_none_of_ours_is_refused(text: str) -> None:
+def test_foreign_texts_are_refused(text: str) -> None:
     with pytest.raises(ScenarioError) as error:
         load_scenario("paper", {"link": {"model": "trace", "trace": text}})
     assert error.value.path.endswith(".trace")
@@ -144,12 +144,12 @@ def scenario(folder: Path, link: str) -> Any:
     return parse_scenario(text, "mine", folder=folder)
 
 
-def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
+def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n0.001,lost\n0.0025,0\n", encoding="utf-8")
-    made = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
-    assert {link.trace for link in made.links.values()} == {TEXT}
-    assert "delays.csv" not in made.text
-    assert parse_scenario(made.text) == made
+    loaded = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
+    assert {link.trace for link in loaded.links.values()} == {TEXT}
+    assert "delays.csv" not in loaded.text
+    assert parse_scenario(loaded.text) == loaded
     (path := tmp_path / "mine.toml").write_text(
         read_shipped("paper").replace(
             "delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'
@@ -157,31 +157,31 @@ def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
         "utf-8",
     )
     assert load_scenario(path).links["m1->s"].trace == TEXT
-    setup = made.setup("s").links[0]
+    setup = loaded.setup("s").links[0]
     assert setup.models[0].at_end == TraceEnd.LOOP
     assert setup.traces[0] is not None
     assert setup.traces[0].tolist() == POINTS
 
 
-def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
+def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
     file = 'file = "delays.csv"'
-    made = scenario(
+    loaded = scenario(
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"'
     )
-    assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 7", "0 41200")
-    made = scenario(
+    assert (loaded.links["m1->s"].trace, loaded.links["m2->s"].trace) == ("0 7", "0 41200")
+    loaded = scenario(
         tmp_path, f'[link]\nmodel = "trace"\ntrace = "0 7"\n[links."m1->s"]\n{file}'
     )
-    assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 41200", "0 7")
-    made = scenario(
+    assert (loaded.links["m1->s"].trace, loaded.links["m2->s"].trace) == ("0 41200", "0 7")
+    loaded = scenario(
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"'
     )
-    assert (made.links["m1->s"].at_end, made.links["m2->s"].at_end) == ("loop", "hold")
+    assert (loaded.links["m1->s"].at_end, loaded.links["m2->s"].at_end) == ("loop", "hold")
 
 
 @pytest.mark.parametrize(
-    ("link", "path", "words"),
+    ("link", "path", "phrase"),
     [
         ('[link]\nmodel = "trace"', "links.m2->m1.file", "is missing"),
         (
@@ -197,10 +197,10 @@ def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
         ('[link]\nmodel = "trace"\nfile = 5', "link.file", "No such file"),
     ],
 )
-def test_where_a_trace_comes_from_is_said_once(
-    tmp_path: Path, link: str, path: str, words: str
+def test_a_traces_origin_is_named_once(
+    tmp_path: Path, link: str, path: str, phrase: str
 ) -> None:
     with pytest.raises(ScenarioError) as error:
         scenario(tmp_path, link)
     assert error.value.path == path
-    assert words in error.value.problem
+    assert phrase in error.value.problem

@@ -14,28 +14,30 @@ from trilat_net.scenario.rest_bounds import find_rest_bounds
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
+def compare_texts(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
     return {
-        str(one): one.values
-        for one in compare_scenarios([load_scenario(name, sets) for name, sets in scenarios])
+        str(difference): difference.values
+        for difference in compare_scenarios(
+            [load_scenario(name, sets) for name, sets in scenarios]
+        )
     }
 
 
-def test_one_experiment_differs_in_nothing_whatever_it_is_called() -> None:
-    assert told(("free", []), ("free", ["name=other", "expect.stable=false"])) == {}
+def test_renamed_experiments_do_not_differ() -> None:
+    assert compare_texts(("free", []), ("free", ["name=other", "expect.stable=false"])) == {}
 
 
 def test_a_gain_of_all_sites_is_one_line() -> None:
-    assert told(("free", []), ("free", ["control.Kd=5"])) == {
+    assert compare_texts(("free", []), ("free", ["control.Kd=5"])) == {
         "control.Kd of m1, m2, s": ("3", "5")
     }
-    found = told(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
-    assert found == {"control.Kd of s": ("3", "[5, 6]")}
+    differences = compare_texts(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
+    assert differences == {"control.Kd of s": ("3", "[5, 6]")}
 
 
-def test_another_law_is_told_as_a_whole() -> None:
-    found = told(("free", []), ("free", ["control.law=p_d"]))
-    assert found == {
+def test_another_law_is_shown_whole() -> None:
+    differences = compare_texts(("free", []), ("free", ["control.law=p_d"]))
+    assert differences == {
         "control of m1, m2, s": (
             "adaptive (Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0)",
             "p_d (K 10, d 3, gravity 1)",
@@ -43,25 +45,25 @@ def test_another_law_is_told_as_a_whole() -> None:
     }
 
 
-def test_links_are_told_in_words() -> None:
-    found = told(
+def test_links_are_described_in_words() -> None:
+    differences = compare_texts(
         ("free", []), ("free", ["link.delay_ms=50"]), ("free", ["links.m1->s.delay_ms=9"])
     )
-    assert found == {
+    assert differences == {
         "link m1->s": ("200 ms", "50 ms", "9 ms"),
         "link m2->m1, s->m1, m1->m2, s->m2, m2->s": ("200 ms", "50 ms", "200 ms"),
     }
 
 
 def test_other_scenarios_other_sites_other_hands() -> None:
-    found = told(("contact", []), ("free", []))
-    assert found["sites"] == ("m, s", "m1, m2, s")
-    assert "wall" in found["environment of s"][0]
-    assert found["environment of s"][1] == "none"
-    assert found["duration_s"] == ("15", "30")
+    differences = compare_texts(("contact", []), ("free", []))
+    assert differences["sites"] == ("m, s", "m1, m2, s")
+    assert "wall" in differences["environment of s"][0]
+    assert differences["environment of s"][1] == "none"
+    assert differences["duration_s"] == ("15", "30")
 
 
-def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
+def test_chains_are_described_by_joint() -> None:
     unlimited = (
         (SHIPPED_FOLDER / "arm6.urdf")
         .read_text()
@@ -83,7 +85,7 @@ def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
     assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
 
 
-def test_limits_of_a_real_arm_are_said_first() -> None:
+def test_limits_of_real_arms_come_first() -> None:
     (line,) = [
         line for line in describe_scenario(EXAMPLES / "external_arm.toml")[:2] if "real" in line
     ]
@@ -98,7 +100,7 @@ def test_limits_of_a_real_arm_are_said_first() -> None:
     assert not [line for line in describe_scenario("free") if "real arm" in line]
 
 
-def test_it_says_how_often_a_site_will_hold() -> None:
+def test_checks_predict_holds_of_a_site() -> None:
     keys = {"on_stale.action": "glide", "link.model": "normal", "duration_s": 6.0, "seed": 3}
     link = {"link.delay_ms": 60.0, "link.deviation_ms": 25.0, "link.loss": 0.6}
     scenario = load_scenario("two_sites", {**keys, **link})
@@ -110,14 +112,16 @@ def test_it_says_how_often_a_site_will_hold() -> None:
     assert f"will hold {10 * entered:.3g} times a minute" in line
 
 
-def test_of_a_site_that_never_holds_it_says_nothing() -> None:
+def test_sites_that_never_hold_get_no_remark() -> None:
     glide = load_scenario("two_sites", {"on_stale.action": "glide", "duration_s": 2.0})
     assert not [line for line in describe_scenario(glide) if "times a minute" in line]
     assert describe_scenario("two_sites") == describe_scenario(load_scenario("two_sites"))
 
 
 def test_check_states_the_time_to_rest() -> None:
-    """Of every site under `glide`, and of an arm that is faster than its motors bear how fast joints get."""
+    """For every site under `glide`; and for an arm too fast for its motors, the speed that its
+    joints reach.
+    """
     scenario = load_scenario("free", {"on_stale.action": "glide"})
     bounds = find_rest_bounds(scenario, "s")
     lines = [line for line in describe_scenario(scenario) if line.startswith("arms of")]
@@ -135,7 +139,11 @@ def test_check_states_the_time_to_rest() -> None:
 
 @pytest.mark.parametrize("name", ["free", "paper_rods", "play", "six_joints", "unlike_arms"])
 def test_motors_bear_the_speeds_of_shipped_scenarios(name: str) -> None:
-    """Eq. (7) of docs/theory/coming-to-rest.md: the limits of torque hold gravity and Coriolis torques."""
+    """Eq.
+
+    (7) of docs/theory/coming-to-rest.md: the limits of torque hold gravity and Coriolis
+    torques.
+    """
     scenario = load_scenario(name, {"on_stale.action": "glide"})
     for site in scenario.names:
         bounds = find_rest_bounds(scenario, site)
@@ -175,21 +183,21 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
         ),
     ],
 )
-def test_a_check_says_which_shares_have_no_effect(
+def test_a_check_names_shares_without_effect(
     law: dict[str, object], more: dict[str, object], expected: list[str]
 ) -> None:
     scenario = unit_scenario(
         {"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more}
     )
-    found = [
+    lines = [
         line
         for line in describe_scenario(scenario)
         if line.startswith("dominance without effect")
     ]
-    assert found == [f"dominance without effect at {line}" for line in expected]
+    assert lines == [f"dominance without effect at {line}" for line in expected]
 
 
-def test_lines_have_shares_of_their_sites_and_b_on_average() -> None:
+def test_lines_share_by_site_and_average_b() -> None:
     law = {"law": "wave", "b": [6.0, 3.0]}
     scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
     total = np.zeros(2)

@@ -29,28 +29,28 @@ EXAMPLE: dict[str, Any] = {
 }
 
 
-def drawn(seed: int) -> Scenario:
+def draw_scenario(seed: int) -> Scenario:
     return load_scenario("free", {**EXAMPLE, "seed": seed})
 
 
-def test_each_number_is_drawn_by_itself() -> None:
+def test_each_number_is_drawn_separately() -> None:
     """Joints, sites and seeds differ; the same seed gives the same."""
-    one, other = drawn(1), drawn(2)
-    assert one == drawn(1)
-    assert len(set(one.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
-    assert len({spec.arm.m1_kg for spec in (*one.sites.values(), *other.sites.values())}) == 6
-    assert one.random
-    assert not one.links_random
-    assert one.drawn["sites.m1.q0_rad.1"].value == one.sites["m1"].q0_rad[1]
+    first, other = draw_scenario(1), draw_scenario(2)
+    assert first == draw_scenario(1)
+    assert len(set(first.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
+    assert len({spec.arm.m1_kg for spec in (*first.sites.values(), *other.sites.values())}) == 6
+    assert first.random
+    assert not first.links_random
+    assert first.drawn["sites.m1.q0_rad.1"].value == first.sites["m1"].q0_rad[1]
 
 
-def test_another_number_that_is_drawn_changes_none() -> None:
-    more = load_scenario(drawn(1), {"sites.s.q0_rad": {"normal": [0.0, 1.0]}})
-    assert more.sites["m1"] == drawn(1).sites["m1"]
-    assert more.sites["s"].q0_rad != drawn(1).sites["s"].q0_rad
+def test_further_drawn_numbers_change_none() -> None:
+    more = load_scenario(draw_scenario(1), {"sites.s.q0_rad": {"normal": [0.0, 1.0]}})
+    assert more.sites["m1"] == draw_scenario(1).sites["m1"]
+    assert more.sites["s"].q0_rad != draw_scenario(1).sites["s"].q0_rad
 
 
-def test_numbers_are_distributed_as_asked() -> None:
+def test_numbers_follow_their_distribution() -> None:
     """By the statistic of Kolmogorov and Smirnov, at 1e-4: a wrong mean or width of 10 % fails."""
     from scipy import stats
 
@@ -62,22 +62,22 @@ def test_numbers_are_distributed_as_asked() -> None:
     assert abs(np.corrcoef(normal[1:], normal[:-1])[0, 1]) < 0.08
 
 
-def test_the_text_is_canonical_and_holds_what_was_drawn() -> None:
-    one = drawn(3)
-    again = parse_scenario(one.text)
-    assert again == one
-    assert again.sha256 == one.sha256
+def test_canonical_text_holds_the_drawn_numbers() -> None:
+    drawn_scenario = draw_scenario(3)
+    again = parse_scenario(drawn_scenario.text)
+    assert again == drawn_scenario
+    assert again.sha256 == drawn_scenario.sha256
     assert "[drawn" not in load_scenario("free").text
 
 
-def test_another_seed_draws_again_wherever_the_scenario_came_from() -> None:
+def test_another_seed_draws_again_from_any_source() -> None:
     """From a scenario, and from the text of a log: hands that hold the start pose too."""
     for found in (
-        reseed_scenario(drawn(1), 5),
-        reseed_scenario(parse_scenario(drawn(2).text), 5),
+        reseed_scenario(draw_scenario(1), 5),
+        reseed_scenario(parse_scenario(draw_scenario(2).text), 5),
     ):
-        assert found == drawn(5)
-        assert found.sha256 == drawn(5).sha256
+        assert found == draw_scenario(5)
+        assert found.sha256 == draw_scenario(5).sha256
     spring, tip, _ = found.sites["m1"].hands
     assert spring.from_rad == spring.to_rad == found.sites["m1"].q0_rad
     a, b = found.sites["m1"].q0_rad
@@ -102,10 +102,10 @@ ends = st.tuples(st.floats(0.5, 2.0), st.floats(2.0, 9.0)).map(list)
     drawn_there=st.dictionaries(st.sampled_from(PLACES), ends),
     seeds=st.tuples(*[st.integers(0, 2**63 - 1)] * 2),
 )
-def test_there_and_back_is_the_same_experiment(
+def test_changing_seeds_back_restores_the_experiment(
     drawn_there: dict[str, list[float]], seeds: tuple[int, int]
 ) -> None:
-    """Whatever is drawn: the text loads to itself, and the first seed again gives the first experiment."""
+    """For any draw: the text loads to itself, and the first seed again gives the first experiment."""
     ranges = {
         key: {"uniform": two}
         for key, two in drawn_there.items()
@@ -121,21 +121,23 @@ def test_there_and_back_is_the_same_experiment(
     other = reseed_scenario(first, seeds[1])
     assert parse_scenario(other.text).text == other.text
     assert reseed_scenario(other, seeds[0]) == first
-    for key, one in other.drawn.items():
-        if one.uniform:
-            assert one.uniform[0] - 1e-8 <= one.value <= one.uniform[1] + 1e-8, key
+    for key, number in other.drawn.items():
+        if number.uniform:
+            assert number.uniform[0] - 1e-8 <= number.value <= number.uniform[1] + 1e-8, key
 
 
-def test_a_number_that_was_replaced_stays() -> None:
-    fixed = load_scenario(drawn(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"})
+def test_replaced_numbers_stay() -> None:
+    fixed = load_scenario(
+        draw_scenario(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"}
+    )
     other = reseed_scenario(fixed, 2)
     assert other.sites["m1"].q0_rad == (0.3, 0.0)
-    assert other.sites["m1"].arm == drawn(2).sites["m1"].arm
+    assert other.sites["m1"].arm == draw_scenario(2).sites["m1"].arm
     assert not any(".control." in key for key in other.drawn)
 
 
-def test_an_experiment_without_operators_is_still_itself() -> None:
-    alone = drawn(1).without_hands()
+def test_an_experiment_without_operators_stays_itself() -> None:
+    alone = draw_scenario(1).without_hands()
     assert parse_scenario(alone.text) == alone
 
 
@@ -158,7 +160,7 @@ def test_an_experiment_without_operators_is_still_itself() -> None:
         ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn: "),
     ],
 )
-def test_what_is_no_distribution_is_refused_at_its_key(
+def test_invalid_distributions_are_refused_at_their_key(
     key: str, value: Any, problem: str
 ) -> None:
     with pytest.raises(ScenarioError) as refused:

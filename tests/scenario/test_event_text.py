@@ -30,7 +30,9 @@ CHANGES = {
 
 
 def event_of(table: dict[str, Any], text: str = "s takes in {}") -> tuple[str, str, str]:
-    """Kind, text and command of an event, as older programs wrote them: the text quotes the command."""
+    """Returns kind, text and command of an event, as older programs wrote them: the text quotes
+    the command.
+    """
     command = json.dumps(table)
     return "change", text.format(command), command
 
@@ -55,7 +57,7 @@ def test_every_order_is_a_sentence(order: str) -> None:
     assert "1 ticks" not in sentence
 
 
-def test_who_ordered_a_stop_is_found_again() -> None:
+def test_the_source_of_a_stop_is_recovered() -> None:
     change = Change(at_s=58.2, site="m2", order="stop")
     for who in ("the experimenter", "the user of m1", "a watcher at a terminal"):
         assert find_requester(describe_change(change, who)) == who

@@ -1,4 +1,4 @@
-"""The table [expect]: what may stand in it, what is refused, and that it is part of the scenario's text."""
+"""The table [expect]: its valid keys, its refusals, and its place in the scenario's text."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ def with_expect(**keys: Any) -> Expect:
     return load_scenario("free", {f"expect.{key}": value for key, value in keys.items()}).expect
 
 
-def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
+def test_without_keys_nothing_is_expected() -> None:
     assert not Expect().has_expectations
     assert not Expect(synchronised_rad=0.5, end_pose_within_rad=0.5).has_expectations
 
@@ -31,7 +31,7 @@ def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
     ],
     ids=str,
 )
-def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any]) -> None:
+def test_other_keys_always_expect_something(keys: dict[str, Any]) -> None:
     assert Expect(**keys).has_expectations
 
 
@@ -52,7 +52,7 @@ def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any])
         ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
     ],
 )
-def test_what_cannot_be_right_is_refused_with_its_key(
+def test_impossible_expectations_are_refused_with_their_key(
     key: str, value: Any, facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as error:
@@ -71,7 +71,7 @@ def test_a_pair_of_limits_must_leave_room() -> None:
     )
 
 
-def test_it_survives_the_canonical_text_and_names_another_experiment() -> None:
+def test_expectations_enter_the_canonical_text() -> None:
     scenario = load_scenario(
         "free", {"expect.end_pose_rad": {"s": [0.1, -0.2]}, "expect.stable": False}
     )
@@ -104,7 +104,7 @@ def test_a_window_is_part_of_the_scenarios_text() -> None:
     ],
     ids=str,
 )
-def test_window_that_cannot_be_right_is_refused_with_its_key(
+def test_invalid_windows_are_refused_with_their_key(
     changes: dict[str, Any], facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as error:
@@ -113,7 +113,7 @@ def test_window_that_cannot_be_right_is_refused_with_its_key(
         assert fact in str(error.value)
 
 
-def test_a_window_that_asks_nothing_is_refused() -> None:
+def test_an_empty_window_is_refused() -> None:
     with pytest.raises(
         ScenarioError,
         match=r"expect.windows\[0\]: expects nothing; the possible keys are error_peak_rad",
@@ -121,22 +121,22 @@ def test_a_window_that_asks_nothing_is_refused() -> None:
         with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 
 
-def test_template_names_every_key_with_value_that_is_valid() -> None:
+def test_template_names_every_key_with_valid_values() -> None:
     commented = read_template().partition("# [expect]")[2].splitlines()[1:]
     text = (
         read_template()
         + "\n[expect]\n"
         + "\n".join(line.removeprefix("# ") for line in commented)
     )
-    written = parse_scenario(text).expect
+    expect = parse_scenario(text).expect
     named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
     window = ["from_s", "to_s", "site", *window_quantities(2)]
     assert set(named[: -len(window)]) | {"windows"} == set(Expect.__struct_fields__)
     assert named[-len(window) :] == window
-    assert [key for key, _ in written.windows[0].limits] == window[3:]
+    assert [key for key, _ in expect.windows[0].limits] == window[3:]
 
 
-def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
+def test_windows_have_quantities_of_all_joints() -> None:
     window = {
         "from_s": 1.0,
         "to_s": 2.0,
@@ -144,8 +144,8 @@ def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
         "q6_rad": [0.0, 1.0],
         "push5_mean_nm": [0.0, 1.0],
     }
-    asked = six(**{"expect.windows": [window]}).expect.windows[0].limits
-    assert dict(asked) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
+    limits = six(**{"expect.windows": [window]}).expect.windows[0].limits
+    assert dict(limits) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
     with pytest.raises(
         ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"
     ):
@@ -156,8 +156,8 @@ def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
         with_expect(windows=[window])
 
 
-def test_a_window_may_name_joints_as_their_file_does() -> None:
-    """It is the same window as one with their numbers, so that nothing else knows the difference."""
+def test_windows_may_name_joints() -> None:
+    """A window with names equals one with numbers, so that no other code has to distinguish them."""
 
     def windows(**keys: Any) -> tuple[ExpectWindow, ...]:
         return six(
@@ -166,9 +166,9 @@ def test_a_window_may_name_joints_as_their_file_does() -> None:
 
     named = windows(q_elbow_rad=[0.0, 1.0], push_wrist_1_mean_nm=[-1.0, 1.0])
     assert named == windows(q3_rad=[0.0, 1.0], push4_mean_nm=[-1.0, 1.0])
-    for keys, words in (
+    for keys, reason in (
         ({"q_elbo_rad": [0, 1]}, r"expect\.windows\[0\]\.q_elbo_rad: unknown key"),
         ({"q_elbow_rad": [0, 1], "q3_rad": [0, 1]}, "repeats q3_rad"),
     ):
-        with pytest.raises(ScenarioError, match=words):
+        with pytest.raises(ScenarioError, match=reason):
             windows(**keys)

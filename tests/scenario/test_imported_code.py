@@ -1,4 +1,4 @@
-"""A law from outside is named by where it is and by the hash of its file; naming it runs nothing."""
+"""A law from outside is named by its place and by the hash of its file; naming a law runs no code."""
 
 import hashlib
 import sys
@@ -21,7 +21,7 @@ class Law: pass
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package whose modules must not be imported, in the folder that the person is in."""
+    """A package whose modules must not be imported, in the current folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "trap_package").mkdir()
     for name in ("trap_package/__init__.py", "trap_package/trap.py", "trap_alone.py"):
@@ -30,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("module", ["trap_package.trap", "trap_package", "trap_alone"])
-def test_naming_a_law_hashes_its_file_and_runs_nothing(module: str, folder: Path) -> None:
+def test_naming_a_law_hashes_without_running(module: str, folder: Path) -> None:
     scenario = load_scenario("two_sites", {"control.law": f"{module}:Law", "control.gain": 3})
     file = folder / f"{module.replace('.', '/')}.py"
     file = file if file.exists() else folder / module / "__init__.py"
@@ -42,7 +42,7 @@ def test_naming_a_law_hashes_its_file_and_runs_nothing(module: str, folder: Path
 
 
 def test_a_named_law_is_imported_only_where_defined(folder: Path) -> None:
-    """The hash is that of the file: a class from elsewhere would not be in it."""
+    """The hash is that of the file: a class from elsewhere would not be covered by the hash."""
     (folder / "borrowed.py").write_text(
         "raise RuntimeError('it ran')\nfrom tests.laws import Adaptive\n"
     )
@@ -61,7 +61,7 @@ def test_a_named_law_is_imported_only_where_defined(folder: Path) -> None:
         (".laws:Law", "must have the form package.module:Law"),
     ],
 )
-def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -> None:
+def test_invalid_names_are_refused_while_reading(law: str, fact: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         load_scenario("two_sites", {"sites.s.control.law": law})
     assert caught.value.path == "sites.s.control.law"
@@ -84,9 +84,7 @@ def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -
         ),
     ],
 )
-def test_a_wrong_law_is_refused_as_the_site_is_built(
-    overrides: dict[str, object], fact: str
-) -> None:
+def test_wrong_laws_are_refused_while_building(overrides: dict[str, object], fact: str) -> None:
     scenario = load_scenario("paper", overrides)
     with pytest.raises(ScenarioError) as caught:
         Site(scenario.setup("s"))
@@ -97,22 +95,22 @@ def test_a_wrong_law_is_refused_as_the_site_is_built(
 @pytest.mark.parametrize(
     ("name", "law"), [("two_sites", "Pair"), ("two_sites", "Few"), ("paper", "Few")]
 )
-def test_a_law_made_for_a_number_of_sites_gets_it(name: str, law: str) -> None:
+def test_laws_for_several_sites_get_the_number(name: str, law: str) -> None:
     Site(load_scenario(name, {"control.law": f"tests.laws:{law}"}).setup("s"))
 
 
-def test_a_law_is_not_told_what_nobody_knows() -> None:
+def test_laws_do_not_get_unknown_parameters() -> None:
     unknown = {"sites.s.plant": "external", "sites.s.arm.known": False}
-    told = []
+    parameters = []
 
     class Listening(tests.laws.Adaptive):
         def __init__(self, facts: tests.laws.LawContext) -> None:
             super().__init__(facts)
-            told.append(facts.theta)
+            parameters.append(facts.theta)
 
     Site(load_scenario("two_sites", unknown).setup("s")._replace(law_factory=Listening))
     Site(load_scenario("two_sites").setup("s")._replace(law_factory=Listening))
-    assert told == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
+    assert parameters == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
     scenario = load_scenario(
         "two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"}
     )
@@ -120,15 +118,15 @@ def test_a_law_is_not_told_what_nobody_knows() -> None:
         Site(scenario.setup("s"))
 
 
-def test_an_edited_law_file_is_taken_as_it_is_now(folder: Path) -> None:
+def test_edited_law_files_are_taken_anew(folder: Path) -> None:
     file = folder / "edited_law.py"
     text = "from tests.laws import Adaptive\nclass Law(Adaptive):\n    theta_hat0 = {}\n"
-    made = []
+    laws = []
     for value in ("1", "2.5"):
         file.write_text(text.format(value))
         site = Site(load_scenario("two_sites", {"control.law": "edited_law:Law"}).setup("s"))
-        made.append(site._user_law.theta_hat0)
-    assert made == [1, 2.5]
+        laws.append(site._user_law.theta_hat0)
+    assert laws == [1, 2.5]
 
 
 RESOLVED = load_scenario(
@@ -152,7 +150,7 @@ RESOLVED = load_scenario(
     ],
     ids=str,
 )
-def test_overrides_of_resolved_scenario_reach_what_law_is_made_with(
+def test_overrides_reach_the_arguments_of_laws(
     overrides: list[str], settings: tuple[dict[str, object], ...]
 ) -> None:
     changed = load_scenario(RESOLVED, overrides)
@@ -165,7 +163,7 @@ def test_settings_stand_beside_the_name_of_the_law() -> None:
         load_scenario("paper", {"control.law": LAW, "control.settings.Kd": 2})
 
 
-def test_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
+def test_resolved_scenarios_use_no_other_file() -> None:
     other = load_scenario(
         RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64)
     )
@@ -185,12 +183,12 @@ class Law(Base):
 
 
 def load_sending(folder: Path, sends: str) -> Scenario:
-    """Returns a scenario of three sites whose law declares what it sends."""
+    """Returns a scenario of three sites whose law declares its messages."""
     (folder / "sending.py").write_text(SENDING.replace("{SENDS}", sends))
     return load_scenario("paper", {"control.law": "sending:Law"})
 
 
-def test_what_a_law_sends_stands_in_the_scenario(folder: Path) -> None:
+def test_messages_of_a_law_stand_in_scenarios(folder: Path) -> None:
     sends = (
         "{'u': {'unit': 'sqrt(W)', 'per_peer': True}, 'E': {'unit': 'J', 'length': 1}, 'w': {}}"
     )
@@ -215,7 +213,7 @@ def test_what_a_law_sends_stands_in_the_scenario(folder: Path) -> None:
             ]
 
 
-def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> None:
+def test_laws_without_messages_leave_scenarios_unchanged(folder: Path) -> None:
     scenario = load_sending(folder, "{}")
     assert "sends" not in scenario.text
     assert "ch" not in scenario.layout("s").lengths()
@@ -241,7 +239,7 @@ def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> N
         ),
     ],
 )
-def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
+def test_invalid_messages_are_refused_while_reading(
     sends: str, key: str, fact: str, folder: Path
 ) -> None:
     with pytest.raises(ScenarioError) as caught:
@@ -262,13 +260,13 @@ def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
         ("{'u': {}}; schemes = ('digital',)", {"scheme": "digital"}, ""),
     ],
 )
-def test_a_site_is_built_with_its_named_law_and_scheme(
+def test_sites_get_their_named_law_and_scheme(
     sends: str, overrides: dict[str, object], fact: str, folder: Path
 ) -> None:
     scenario = load_sending(folder, "{'u': {}}")
-    made = "def __init__(self, *_): raise OSError"
+    method = "def __init__(self, *_): raise OSError"
     file, before = folder / "sending.py", scenario.sites["s"].control.source_sha256
-    file.write_text(SENDING.replace("{SENDS}", f"{sends}\n    {made}"))
+    file.write_text(SENDING.replace("{SENDS}", f"{sends}\n    {method}"))
     named = scenario.text.replace(before, hashlib.sha256(file.read_bytes()).hexdigest())
     scenario = load_scenario(load_scenario(named), overrides)
     with pytest.raises(ScenarioError, match=fact or "OSError"):

@@ -1,4 +1,4 @@
-"""What a law needs and a scenario does not give is refused, with the reason."""
+"""A scenario that lacks the needs of a law is refused, with the reason."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
         ),
     ],
 )
-def test_a_law_that_cannot_do_its_work_is_refused(
+def test_laws_without_their_needs_are_refused(
     name: str, overrides: dict[str, Any], path: str, fact: str
 ) -> None:
     with pytest.raises(ScenarioError) as caught:
@@ -66,7 +66,7 @@ def test_a_law_that_cannot_do_its_work_is_refused(
     ],
     ids=str,
 )
-def test_law_that_needs_no_masses_drives_arm_that_nobody_knows(
+def test_mass_free_laws_drive_unknown_arms(
     overrides: dict[str, Any],
 ) -> None:
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
@@ -74,7 +74,7 @@ def test_law_that_needs_no_masses_drives_arm_that_nobody_knows(
     assert parse_scenario(scenario.text) == scenario
 
 
-def test_a_known_arm_is_not_mentioned_for_the_hashes_sake() -> None:
+def test_default_known_arms_stay_out_of_text() -> None:
     assert "known" not in load_scenario("two_sites").text
     assert (
         load_scenario("two_sites", {"arm.known": True}).sha256

@@ -1,4 +1,6 @@
-"""Masses and inertias of a scenario in place of a URDF's, balanced ones, and links off the way to the tip."""
+"""Masses and inertias of a scenario in place of a URDF's, balanced ones, and links off the way
+to the tip.
+"""
 
 import math
 import re
@@ -35,7 +37,7 @@ YAW = {"mass_kg": 0.5, "inertia_kg_m2": [1e-2, 0.0, 1e-2, 0.0, 0.0, 1e-2]}
 
 
 def of_arm(text: str, arm: dict[str, Any], **sites: Any) -> Scenario:
-    """Returns a scenario of two such arms."""
+    """Returns a scenario of two arms of the given kind."""
     tables = {
         **TWO_SITES,
         "arm": {"urdf": "robot.urdf", "armature_kg_m2": 0.1, **arm},
@@ -60,7 +62,7 @@ def moments(tensor: Matrix) -> list[float]:
 
 
 def body_moments(chain: UrdfChain, joint: int) -> list[float]:
-    """Returns the principal moments of what a joint moves, about its centre of mass."""
+    """Returns the principal moments of the bodies that a joint moves, about their centre of mass."""
     m, *first = chain.joints[joint].inertia[:4]
     c = np.array(first) / m
     about = np.array(fill_tensor(chain.joints[joint].inertia[4:]))
@@ -72,7 +74,7 @@ def body_moments(chain: UrdfChain, joint: int) -> list[float]:
 # A link that does not lead to the end link
 
 
-def test_a_finger_with_impossible_inertia_is_lumped_and_noted() -> None:
+def test_impossible_finger_inertia_is_lumped_with_note() -> None:
     chain = read_urdf(FINGER, tip="lower")
     assert [joint.name for joint in chain.joints] == ["shoulder", "elbow"]
     assert chain.joints[1].inertia[0] == 1.02
@@ -132,18 +134,18 @@ def test_a_finger_with_impossible_inertia_is_lumped_and_noted() -> None:
         ("", "revolute", 1.0, "left out"),
     ],
 )
-def test_no_link_off_the_way_makes_an_arm_unusable(
+def test_side_links_never_make_arms_unusable(
     body: str, kind: str, mass_kg: float, note: str
 ) -> None:
     chain = read_urdf(finger(body=body, kind=kind), tip="lower")
     assert chain.joints[1].inertia[0] == mass_kg
-    assert any(note in one for one in chain.notes)
+    assert any(note in text for text in chain.notes)
     least, middle, most = body_moments(chain, 1)
     assert least > 0.0
     assert most <= (least + middle) * (1.0 + 1e-6)
 
 
-def test_a_finger_that_is_the_end_link_is_refused_with_three_remedies() -> None:
+def test_a_finger_as_end_link_is_refused() -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(FINGER, {})
     assert refused.value.path == "sites.m.arm.urdf"
@@ -166,7 +168,7 @@ ENTRY = st.floats(-1.0, 1.0)
 
 
 @given(st.tuples(*[ENTRY] * 6))
-def test_balanced_inertia_is_the_nearest_that_a_body_has(entries: tuple[float, ...]) -> None:
+def test_balanced_inertia_is_the_nearest_body(entries: tuple[float, ...]) -> None:
     """Against the projection of the second moments of mass by NumPy's eigenvectors."""
     tensor = fill_tensor(entries)
     balanced = balance_tensor(tensor)
@@ -182,7 +184,7 @@ def test_balanced_inertia_is_the_nearest_that_a_body_has(entries: tuple[float, .
     assert np.abs(np.array(balance_tensor(balanced)) - balanced).max() < 1e-12
 
 
-def test_balancing_keeps_the_largest_moment_and_a_possible_tensor() -> None:
+def test_balancing_keeps_the_largest_moment() -> None:
     possible = fill_tensor((2.0, 0.1, 2.5, 0.2, -0.1, 3.0))
     assert balance_tensor(possible) is possible
     chain = read_urdf(FINGER, balance=True)
@@ -193,7 +195,7 @@ def test_balancing_keeps_the_largest_moment_and_a_possible_tensor() -> None:
 # Masses and inertias of a scenario
 
 
-def test_shapes_without_masses_become_an_arm_by_keys() -> None:
+def test_shapes_without_masses_become_arms() -> None:
     with pytest.raises(
         ScenarioError, match=r"'yaw'.*give mass_kg and inertia_kg_m2 in \[arm.links.yaw\]"
     ):
@@ -212,7 +214,7 @@ TURNED = FINGER.replace(
 TURNED = TURNED.replace('ixx="0.01"', 'ixx="0.005"')
 
 
-def test_a_key_that_is_left_out_keeps_the_value_of_the_file() -> None:
+def test_omitted_keys_keep_the_files_value() -> None:
     """The axes of the file's tensor stay turned; a tensor of the scenario stands in the link's axes."""
 
     def upper(**given: Any) -> list[float]:
@@ -249,7 +251,7 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("links", "path", "words"),
+    ("links", "path", "phrase"),
     [
         ({"fingr": {"mass_kg": 1.0}}, "links.fingr", "did you mean 'finger'"),
         ({"base": {"mass_kg": 1.0}}, "links.base", "moved by no joint"),
@@ -284,14 +286,14 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
         ({"finger": {"mass_kg": math.inf}}, "arm.links.finger.mass_kg", "finite"),
     ],
 )
-def test_a_wrong_inertia_is_refused_at_its_own_key(links: Any, path: str, words: str) -> None:
+def test_wrong_inertias_are_refused_at_their_key(links: Any, path: str, phrase: str) -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(FINGER, {"tip": "lower", "links": links})
     assert refused.value.path.endswith(path)
-    assert words in refused.value.problem
+    assert phrase in refused.value.problem
 
 
-def test_a_link_of_a_file_without_mass_needs_one() -> None:
+def test_links_without_mass_in_files_need_one() -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(SHAPES, {"links": {"yaw": {"com_m": [0.0, 0.0, 0.1]}}})
     assert refused.value.path == "sites.m.arm.links.yaw.mass_kg"
@@ -305,7 +307,7 @@ def test_a_planar_arm_has_no_links_to_mend() -> None:
 # The text of a scenario
 
 
-def test_keys_of_links_are_part_of_the_text_and_its_hash() -> None:
+def test_link_keys_enter_text_and_hash() -> None:
     scenario = of_arm(SHAPES, {"links": {"yaw": YAW}})
     assert parse_embedded(scenario.text) == scenario
     assert "[sites.m.arm.links.yaw]\nmass_kg = 0.5\n" in scenario.text
@@ -317,7 +319,7 @@ def test_keys_of_links_are_part_of_the_text_and_its_hash() -> None:
     assert "balance" not in six().text
 
 
-def test_overrides_reach_a_link_of_every_arm_or_one() -> None:
+def test_overrides_reach_links_of_arms() -> None:
     scenario = of_arm(FINGER, {"tip": "lower"})
     changed = load_scenario(
         scenario,
@@ -335,11 +337,11 @@ def test_overrides_reach_a_link_of_every_arm_or_one() -> None:
         load_scenario(scenario, ["arm.lnks.finger.mass_kg=1"])
 
 
-def test_a_site_mends_a_link_further_than_all_sites() -> None:
-    """Also a name that TOML quotes, and a number that is drawn."""
+def test_sites_mend_links_beyond_their_group() -> None:
+    """Also for names that TOML quotes, and for drawn numbers."""
     text = SHAPES.replace('"tool"', '"tool.1"')
     shared = {"yaw": YAW, "tool.1": {"mass_kg": 0.4}}
-    own = {
+    tables = {
         "arm": {
             "links": {
                 "tool.1": {"com_m": [0.0, 0.0, 0.1]},
@@ -347,7 +349,7 @@ def test_a_site_mends_a_link_further_than_all_sites() -> None:
             }
         }
     }
-    scenario = of_arm(text, {"links": shared}, s=own)
+    scenario = of_arm(text, {"links": shared}, s=tables)
     m, s = (scenario.sites[name].arm.links for name in "ms")
     assert m["tool.1"] == LinkInertia(mass_kg=0.4)
     assert s["tool.1"] == LinkInertia(mass_kg=0.4, com_m=(0.0, 0.0, 0.1))
@@ -357,7 +359,7 @@ def test_a_site_mends_a_link_further_than_all_sites() -> None:
     assert parse_embedded(scenario.text) == scenario
 
 
-def test_what_differs_from_the_file_is_said() -> None:
+def test_differences_from_the_file_are_listed() -> None:
     scenario = of_arm(
         FINGER, {"tip": "lower", "links": {"upper": {"mass_kg": 2.0}}}, m={"q0_rad": [2.1, 0]}
     )

@@ -1,4 +1,4 @@
-"""Links by name: each is what its source says."""
+"""Links by name: each preset has the numbers of its source."""
 
 import math
 import tomllib
@@ -22,7 +22,7 @@ ROUND_TRIPS_MS = {
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_makes_a_scenario_in_every_place(name: str) -> None:
+def test_presets_make_scenarios_everywhere(name: str) -> None:
     for scenario in (
         load_scenario("paper", [f"link.preset={name}"]),
         load_scenario("paper", {"links": {"m1->s": {"preset": name}}}),
@@ -35,9 +35,7 @@ def test_a_preset_makes_a_scenario_in_every_place(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "round_trip"), ROUND_TRIPS_MS.items())
-def test_a_pair_of_cities_is_half_a_round_trip_away(
-    name: str, round_trip: tuple[float, float]
-) -> None:
+def test_city_pairs_are_half_a_round_trip(name: str, round_trip: tuple[float, float]) -> None:
     mean_ms, deviation_ms = (
         load_scenario("paper", {"link": {"preset": name}}).links["m1->s"].moments()
     )
@@ -45,7 +43,7 @@ def test_a_pair_of_cities_is_half_a_round_trip_away(
     assert math.sqrt(2) * deviation_ms == pytest.approx(round_trip[1], abs=0.01)
 
 
-def test_wifi_has_half_of_the_percentiles_that_were_measured() -> None:
+def test_wifi_has_half_the_measured_percentiles() -> None:
     keys = {key: value for key, value in PRESETS["wifi"].items() if key != "model"}
     link = HyperExponentialDelay(**keys)
     parts = (stats.expon(link.floor_ms, link.fast_ms), stats.expon(link.floor_ms, link.slow_ms))
@@ -56,7 +54,7 @@ def test_wifi_has_half_of_the_percentiles_that_were_measured() -> None:
         )
 
 
-def test_lan_has_half_of_median_and_of_quartiles_distance() -> None:
+def test_lan_has_half_the_measured_quartiles() -> None:
     mean, deviation = PRESETS["lan"]["delay_ms"], PRESETS["lan"]["deviation_ms"]
     law = stats.gamma((mean / deviation) ** 2, scale=deviation**2 / mean)
     assert 2 * law.median() == pytest.approx(0.542, rel=0.01)
@@ -64,7 +62,7 @@ def test_lan_has_half_of_median_and_of_quartiles_distance() -> None:
     assert math.sqrt(2) * quartiles == pytest.approx(0.564 - 0.514, rel=0.05)
 
 
-def test_mobile_and_satellite_have_the_numbers_of_their_sources() -> None:
+def test_mobile_and_satellite_follow_their_sources() -> None:
     def described(name: str) -> str:
         return load_scenario("paper", {"link": {"preset": name}}).links["m1->s"].describe()
 
@@ -78,12 +76,12 @@ def test_mobile_and_satellite_have_the_numbers_of_their_sources() -> None:
     )
 
 
-def test_the_grid_is_half_a_round_trip_and_single_losses() -> None:
+def test_the_grid_follows_half_round_trips() -> None:
     link = load_scenario("paper", {"link": {"preset": "rtt136-loss25"}}).links["m1->s"]
     assert (link.moments(), link.loss, link.loss_burst) == ((68.0, 0.0), 0.25, 0.0)
 
 
-def test_every_preset_of_file_has_comment_with_its_source() -> None:
+def test_every_preset_has_a_sourced_comment() -> None:
     text = _PRESETS_FILE.read_text(encoding="utf-8")
     for name in tomllib.loads(text):
         head = f'["{name}"]' if name[0].isdigit() else f"[{name}]"

@@ -1,4 +1,4 @@
-"""Traces of what irtt, ping and others measured: their own numbers, as they state them."""
+"""Traces measured by irtt, ping and others: their numbers, in each tool's own form."""
 
 import math
 from pathlib import Path
@@ -29,15 +29,13 @@ CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
 
 
 @pytest.mark.parametrize("zipped", [False, True])
-def test_irtt_says_of_round_trips_what_trace_says_of_halves(
-    tmp_path: Path, zipped: bool
-) -> None:
-    found = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
-    facts = found.to_dict()
+def test_irtt_round_trips_give_halves(tmp_path: Path, zipped: bool) -> None:
+    trace = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
+    facts = trace.to_dict()
     assert facts["mean_ms"] == pytest.approx(0.5e-6 * IRTT_MEAN_NS, rel=1e-7)
     sample = facts["deviation_ms"] * math.sqrt(5 / 4)
     assert sample == pytest.approx(0.5e-6 * IRTT_DEVIATION_NS, rel=1e-5)
-    assert [t_s for t_s, _ in found.points] == pytest.approx(
+    assert [t_s for t_s, _ in trace.points] == pytest.approx(
         [(t - SENT_NS[0]) * 1e-9 for t in SENT_NS], abs=1e-6
     )
     assert import_trace(irtt(tmp_path), "irtt", way="whole").delay_ms == pytest.approx(
@@ -45,21 +43,21 @@ def test_irtt_says_of_round_trips_what_trace_says_of_halves(
     )
 
 
-def test_samples_lost_in_irtt_are_lost_and_differing_clocks_told(tmp_path: Path) -> None:
-    found = import_trace(irtt(tmp_path, 1, 2), "irtt")
-    assert [math.isinf(ms) for _, ms in found.points] == [False, True, True, False, False]
-    assert (found.to_dict()["lost_percent"], found.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
+def test_irtt_losses_and_clock_differences_are_kept(tmp_path: Path) -> None:
+    trace = import_trace(irtt(tmp_path, 1, 2), "irtt")
+    assert [math.isinf(ms) for _, ms in trace.points] == [False, True, True, False, False]
+    assert (trace.to_dict()["lost_percent"], trace.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
     with pytest.raises(ScenarioError, match="clocks do not agree"):
         import_trace(irtt(tmp_path), "irtt", way="receive")
     assert import_trace(irtt(tmp_path), "irtt", way="send").too_long == 5
 
 
-def test_a_ping_has_its_gaps_and_the_times_of_sending(tmp_path: Path) -> None:
+def test_pings_keep_gaps_and_times(tmp_path: Path) -> None:
     path = tmp_path / "ping.txt"
     path.write_text(PING)
-    found = import_trace(path, "ping")
-    assert [ms for _, ms in found.points] == [30.3, 28.45, 31.0, math.inf, 32.55]
-    assert found.points[1][0] == pytest.approx(
+    trace = import_trace(path, "ping")
+    assert [ms for _, ms in trace.points] == [30.3, 28.45, 31.0, math.inf, 32.55]
+    assert trace.points[1][0] == pytest.approx(
         0.421290 - 0.0569 - (0.410606 - 0.0606), abs=1e-6
     )
     path.write_text(PING.replace("[17001828", "x [17001828"))
@@ -68,7 +66,7 @@ def test_a_ping_has_its_gaps_and_the_times_of_sending(tmp_path: Path) -> None:
     )
 
 
-def test_a_ping_that_counts_from_zero_again_goes_on(tmp_path: Path) -> None:
+def test_pings_that_restart_counting_continue(tmp_path: Path) -> None:
     path = tmp_path / "ping.txt"
     lines = [
         f"64 bytes from 192.0.2.1: icmp_seq={n} ttl=63 time=2.0 ms"
@@ -78,11 +76,11 @@ def test_a_ping_that_counts_from_zero_again_goes_on(tmp_path: Path) -> None:
     assert [ms for _, ms in import_trace(path, "ping").points] == [1.0, 1.0, 1.0, math.inf, 1.0]
 
 
-def test_a_table_of_the_form_of_cicv5g_makes_a_link(tmp_path: Path) -> None:
+def test_cicv5g_tables_make_a_link(tmp_path: Path) -> None:
     path = tmp_path / "drive.txt"
     path.write_text(CICV5G)
-    found = import_trace(path, "csv", way="half")
-    assert found.points == ((0.0, 11.0), (0.054, 16.5), (0.109, 5250.0))
+    trace_of_link = import_trace(path, "csv", way="half")
+    assert trace_of_link.points == ((0.0, 11.0), (0.054, 16.5), (0.109, 5250.0))
     whole = import_trace(path, "csv")
     assert whole.points == ((0.0, 22.0), (0.054, 33.0), (0.109, math.inf))
     assert whole.too_long == 1
@@ -96,7 +94,7 @@ def test_a_table_of_the_form_of_cicv5g_makes_a_link(tmp_path: Path) -> None:
     assert link.points.tolist() == [[0, 22000], [54000, 33000], [109000, -1]]
 
 
-def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> None:
+def test_columns_state_units_and_round_trips(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("timestamp_s,rtt_ms,uplink_ms\n0,20,12\n1,40,-1\n")
     assert [ms for _, ms in import_trace(path, "csv").points] == [10.0, 20.0]
@@ -120,16 +118,14 @@ def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> No
         ("csv", "t_s,delay_ms\n", "the file has no samples"),
     ],
 )
-def test_what_is_not_of_a_form_is_refused(
-    tmp_path: Path, form: str, text: str, said: str
-) -> None:
+def test_other_forms_are_refused(tmp_path: Path, form: str, text: str, said: str) -> None:
     path = tmp_path / "file"
     path.write_text(text)
     with pytest.raises(ScenarioError, match=said):
         import_trace(path, form)
 
 
-def test_there_is_no_other_form_and_no_other_way(tmp_path: Path) -> None:
+def test_unknown_forms_and_ways_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="irtt, ping, csv"):
         import_trace(tmp_path, "xml")
     with pytest.raises(UsageError, match="half or whole"):

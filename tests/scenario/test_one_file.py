@@ -1,4 +1,6 @@
-"""An operator, an environment and a delay model are one file each: whatever reads scenarios knows it."""
+"""An operator, an environment and a delay model are one file each: every reader of scenarios
+finds an added file.
+"""
 
 import json
 import math
@@ -93,15 +95,15 @@ print(json.dumps({
 @pytest.mark.parametrize(
     "scenario", ["two_sites", pytest.param("six_joints", marks=pytest.mark.long)]
 )
-def test_a_file_beside_the_others_acts_in_every_driver(tmp_path: Path, scenario: str) -> None:
+def test_an_added_file_acts_in_every_driver(tmp_path: Path, scenario: str) -> None:
     put_beside(tmp_path, "scenario/operators", "tremor.py", OPERATOR)
     put_beside(tmp_path, "scenario/delay_models", "two_paths.py", DELAY)
-    found = look(LOOK.replace("SCENARIO", json.dumps(scenario)), tmp_path)
-    assert found["identical"] == [True, True]
-    assert any("two_paths 8.5 +- 3.5 ms" in line for line in found["check"])
-    assert found["moved"] > 0.0
-    assert found["roots"]
-    assert "hands[0].turn_rad_s: must be a frequency, rad/s, but is -1.0" in found["refused"]
+    output = look(LOOK.replace("SCENARIO", json.dumps(scenario)), tmp_path)
+    assert output["identical"] == [True, True]
+    assert any("two_paths 8.5 +- 3.5 ms" in line for line in output["check"])
+    assert output["moved"] > 0.0
+    assert output["roots"]
+    assert "hands[0].turn_rad_s: must be a frequency, rad/s, but is -1.0" in output["refused"]
 
 
 numbers = st.floats(-2.0, 2.0)
@@ -142,7 +144,7 @@ def test_compiled_and_row_functions_of_a_body_agree(
 
 
 @given(body=bodies, depth_mm=st.floats(1e-3, 50.0), speed_m_s=st.floats(0.0, 1.0))
-def test_a_compliant_body_dissipates_whatever_its_depth(
+def test_a_compliant_body_always_dissipates(
     body: HuntCrossley, depth_mm: float, speed_m_s: float
 ) -> None:
     """In and out at one depth and speed: the force on the way out is never the larger."""
@@ -157,7 +159,7 @@ def test_a_compliant_body_dissipates_whatever_its_depth(
     assert still == pytest.approx(body.stiffness_n_m15 * (1e-3 * depth_mm) ** 1.5, rel=1e-6)
 
 
-def test_paths_of_a_low_orbit_stay_for_their_slot() -> None:
+def test_low_orbit_paths_last_their_slot() -> None:
     model = LowOrbit(floor_ms=20.0, path_ms=50.0, jitter_ms=0.0, slot_s=0.1)
     fates = due(
         channel(
@@ -172,11 +174,11 @@ def test_paths_of_a_low_orbit_stay_for_their_slot() -> None:
     assert (delays >= 20_000_000).all()
 
 
-def test_every_kind_of_a_file_of_its_own_is_found() -> None:
-    own = [
+def test_every_kind_of_file_is_found() -> None:
+    kinds = [
         kind
         for kind in (*OPERATORS.values(), *ENVIRONMENTS.values())
         if issubclass(kind, OwnActor)
     ]
-    assert HuntCrossley in own
+    assert HuntCrossley in kinds
     assert DELAY_MODELS["low_orbit"] is LowOrbit

@@ -1,4 +1,4 @@
-"""What authors get wrong of hands and environments: one sentence, at the key, with what would be right."""
+"""Mistakes of authors in hands and environments: one sentence, at the key, with the valid choice."""
 
 import re
 from typing import Any
@@ -36,10 +36,10 @@ def refused(group: str, entry: Any) -> str:
     return path.removeprefix(f"sites.s.{group}[0]") + ": " + problem
 
 
-def test_every_kind_has_an_example_here_that_is_valid() -> None:
+def test_every_kind_has_a_valid_example() -> None:
     for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-        shown = [kind for kind in kinds if kind not in ("live", "own")]
-        assert [entry["kind"] for entry in GROUPS[group]] == shown
+        kinds_of_file = [kind for kind in kinds if kind not in ("live", "own")]
+        assert [entry["kind"] for entry in GROUPS[group]] == kinds_of_file
         assert len(
             getattr(
                 load_scenario("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group
@@ -57,7 +57,7 @@ def test_every_kind_has_an_example_here_that_is_valid() -> None:
     ],
     ids=str,
 )
-def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key: str) -> None:
+def test_missing_keys_name_their_meaning(group: str, entry: Any, key: str) -> None:
     said = refused(group, entry)
     assert said.startswith(f".{key}: is missing; the value must be ")
     assert len(said) > len(f".{key}: is missing; the value must be ") + 10
@@ -73,9 +73,7 @@ def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key
     ],
     ids=str,
 )
-def test_value_of_wrong_kind_is_told_what_its_key_wants(
-    group: str, entry: Any, key: str
-) -> None:
+def test_wrong_types_name_the_wanted_one(group: str, entry: Any, key: str) -> None:
     said = refused(group, entry)
     assert said.startswith(f".{key}: must be ")
     assert key == "points" or said.endswith("is 'x'")
@@ -154,10 +152,10 @@ def test_value_of_wrong_kind_is_told_what_its_key_wants(
     ],
     ids=str,
 )
-def test_what_authors_get_wrong(group: str, entry: Any, said: str) -> None:
+def test_mistakes_are_refused_at_their_key(group: str, entry: Any, said: str) -> None:
     assert re.match(said, refused(group, entry))
 
 
-def test_an_invalid_start_pose_is_refused_at_its_own_key() -> None:
+def test_invalid_start_poses_are_refused_at_keys() -> None:
     with pytest.raises(ScenarioError, match=r"sites.m1.q0_rad"):
         load_scenario("free", {"sites.m1.q0_rad": ["x", 0.0], "sites.m1.hands": [SPRING, TIP]})

@@ -1,4 +1,4 @@
-"""Overrides of a resolved scenario: a key of a group counts for all that can have it."""
+"""Overrides of a resolved scenario: a key of a group applies to every member that can have it."""
 
 import pytest
 
@@ -23,15 +23,13 @@ PAPER = load_scenario("paper")
     ],
     ids=str,
 )
-def test_it_is_what_same_override_gives_as_scenario_is_loaded(
-    name: str, overrides: dict[str, object]
-) -> None:
-    """Of scenarios whose sites and links have nothing of their own."""
+def test_overrides_equal_those_at_loading(name: str, overrides: dict[str, object]) -> None:
+    """For scenarios whose sites and links have no keys of their own."""
     assert load_scenario(load_scenario(name), overrides) == load_scenario(name, overrides)
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None:
+def test_single_keys_override_their_groups(order: int) -> None:
     texts = ["control.Kd=5", "sites.s.control.Kd=7", "link.loss=0.1", "links.m1->s.loss=0.2"][
         ::order
     ]
@@ -52,8 +50,8 @@ def test_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None
         ("sites.m1.q0_rad.2=1", "sites.m1.q0_rad=[0.3, -1.0, 1.0, -0.6, 0.5, 0.2]"),
     ],
 )
-def test_key_of_one_joint_is_that_entry_of_its_vector(one: str, whole: str) -> None:
-    """Also where the author wrote one number for all joints, or the vector of a group."""
+def test_joint_keys_are_entries_of_vectors(one: str, whole: str) -> None:
+    """Even if the author wrote one number for all joints, or the vector of a group."""
     scenario = load_scenario("six_joints", [whole])
     assert (
         load_scenario("six_joints", [one])
@@ -62,12 +60,12 @@ def test_key_of_one_joint_is_that_entry_of_its_vector(one: str, whole: str) -> N
     )
 
 
-def test_another_law_has_its_own_gains_from_the_start() -> None:
+def test_another_law_starts_with_own_gains() -> None:
     control = load_scenario(PAPER, ["control.law=p_d", "control.K=20"]).sites["m2"].control
     assert (control.K, control.d) == ((20.0, 20.0), (3.0, 3.0))
 
 
-def test_key_counts_for_those_whose_law_or_model_has_it() -> None:
+def test_keys_apply_where_laws_have_them() -> None:
     mixed = load_scenario(PAPER, ["sites.m1.control.law=p_d", "links.m1->s.model=measured"])
     again = load_scenario(mixed, ["control.Kd=5", "control.K=30", "link.delay_ms=50"])
     assert again.sites["m1"].control.K == (30.0, 30.0)
@@ -95,7 +93,7 @@ def test_key_counts_for_those_whose_law_or_model_has_it() -> None:
     ],
     ids=str,
 )
-def test_a_key_that_nothing_can_have_is_refused(overrides: list[str], facts: list[str]) -> None:
+def test_inapplicable_keys_are_refused(overrides: list[str], facts: list[str]) -> None:
     with pytest.raises(ScenarioError) as caught:
         load_scenario(PAPER, overrides)
     assert str(caught.value).startswith("paper: ")

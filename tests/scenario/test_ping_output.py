@@ -1,4 +1,4 @@
-"""What `ping` prints on every system: each probe is an answer or a loss, and the text says where it ends."""
+"""The output of `ping` on every system: each probe is an answer or a loss, and the text states the end."""
 
 import math
 import zipfile
@@ -58,25 +58,25 @@ def test_every_probe_of_a_ping_counts(
     last_ms: float,
     end_known: bool,
 ) -> None:
-    found = import_trace(PINGS / f"{name}.txt", "ping", way="whole")
-    facts = found.to_dict()
+    trace = import_trace(PINGS / f"{name}.txt", "ping", way="whole")
+    facts = trace.to_dict()
     assert facts["samples"] == samples
     assert facts["lost_percent"] == pytest.approx(lost_percent)
-    assert (delays(found)[0], delays(found)[-1]) == (first_ms, last_ms)
+    assert (delays(trace)[0], delays(trace)[-1]) == (first_ms, last_ms)
     assert facts["end_known"] == end_known
-    assert ("does not tell how the measurement ended" in found.summary()) != end_known
+    assert ("does not tell how the measurement ended" in trace.summary()) != end_known
 
 
 @pytest.mark.parametrize("head", [IPUTILS, BSD])
 def test_losses_without_lines_count_at_both_ends(tmp_path: Path, head: str) -> None:
     """iputils counts from 1, BSD and busybox from 0; the summary tells the end."""
     first = 1 if head == IPUTILS else 0
-    found = read(tmp_path, head + answers(3, 4) + summary(8, 2))
+    probes = read(tmp_path, head + answers(3, 4) + summary(8, 2))
     expected = [LOST] * 8
     expected[3 - first], expected[4 - first] = 4.0, 5.0
-    assert delays(found) == expected
-    assert found.begin_known
-    assert found.end_known
+    assert delays(probes) == expected
+    assert probes.begin_known
+    assert probes.end_known
 
 
 def test_times_continue_beyond_the_answered_probes(tmp_path: Path) -> None:
@@ -84,8 +84,8 @@ def test_times_continue_beyond_the_answered_probes(tmp_path: Path) -> None:
         f"[{100.005 + 0.2 * n:.6f}] 64 bytes: icmp_seq={n} ttl=64 time=5.0 ms"
         for n in (4, 5, 7)
     ]
-    found = read(tmp_path, IPUTILS + "\n".join(lines) + "\n" + summary(9, 3))
-    assert [t_s for t_s, _ in found.points] == pytest.approx(0.2 * np.arange(9), abs=1e-6)
+    probes = read(tmp_path, IPUTILS + "\n".join(lines) + "\n" + summary(9, 3))
+    assert [t_s for t_s, _ in probes.points] == pytest.approx(0.2 * np.arange(9), abs=1e-6)
 
 
 def test_seeded_losses_are_counted_as_ping_counts_them(tmp_path: Path) -> None:
@@ -96,11 +96,13 @@ def test_seeded_losses_are_counted_as_ping_counts_them(tmp_path: Path) -> None:
         # some overtake others
         order = sorted(answered, key=lambda n: n + 3.0 * random.uniform())
         text = IPUTILS + answers(*order) + answers(*order[:2]) + summary(sent, len(answered))
-        found = read(tmp_path, text)
-        assert found.to_dict()["lost_percent"] == pytest.approx(
+        probes = read(tmp_path, text)
+        assert probes.to_dict()["lost_percent"] == pytest.approx(
             100.0 * (sent - len(answered)) / sent
         )
-        assert delays(found) == [n + 1.0 if n in answered else LOST for n in range(1, sent + 1)]
+        assert delays(probes) == [
+            n + 1.0 if n in answered else LOST for n in range(1, sent + 1)
+        ]
 
 
 WINDOWS = {
@@ -151,10 +153,10 @@ def test_windows_speaks_any_language_and_encoding(
         "    Minimum = 7ms, Maximum = 9ms, Average = 8ms",
         "^C",
     ]
-    found = read(tmp_path, "\r\n".join(lines), encoding, every_s=2.0)
-    assert found.points == ((0.0, LOST), (2.0, 7.0), (4.0, 8.0), (6.0, 9.0))
-    assert found.begin_known
-    assert found.end_known
+    probes = read(tmp_path, "\r\n".join(lines), encoding, every_s=2.0)
+    assert probes.points == ((0.0, LOST), (2.0, 7.0), (4.0, 8.0), (6.0, 9.0))
+    assert probes.begin_known
+    assert probes.end_known
 
 
 @pytest.mark.parametrize(
@@ -182,9 +184,9 @@ def test_windows_speaks_any_language_and_encoding(
     ],
 )  # fmt: skip
 def test_other_forms_of_ping_are_read(tmp_path: Path, text: str, expected: list[float]) -> None:
-    found = read(tmp_path, text)
-    assert delays(found) == expected
-    assert found.end_known
+    probes = read(tmp_path, text)
+    assert delays(probes) == expected
+    assert probes.end_known
 
 
 @pytest.mark.parametrize(
@@ -197,13 +199,13 @@ def test_other_forms_of_ping_are_read(tmp_path: Path, text: str, expected: list[
         ("Reply from 192.0.2.7: bytes=32 time<1ms TTL=53\n", False, [1.0]),
     ],
 )  # fmt: skip
-def test_unfinished_output_says_that_its_end_is_unknown(
+def test_unfinished_output_has_an_unknown_end(
     tmp_path: Path, text: str, begin_known: bool, expected: list[float]
 ) -> None:
-    found = read(tmp_path, text)
-    assert delays(found) == expected
-    assert (found.begin_known, found.end_known) == (begin_known, False)
-    assert ("before its first sample" in found.summary()) != begin_known
+    probes = read(tmp_path, text)
+    assert delays(probes) == expected
+    assert (probes.begin_known, probes.end_known) == (begin_known, False)
+    assert ("before its first sample" in probes.summary()) != begin_known
 
 
 @pytest.mark.parametrize(
@@ -223,9 +225,7 @@ def test_unfinished_output_says_that_its_end_is_unknown(
         ),
     ],
 )
-def test_output_that_contradicts_itself_is_refused(
-    tmp_path: Path, text: str, said: str
-) -> None:
+def test_contradictory_output_is_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(ScenarioError, match=said):
         read(tmp_path, text)
 
@@ -239,9 +239,7 @@ def test_output_that_contradicts_itself_is_refused(
         ("zip", "a.txt"),
     ],
 )
-def test_a_spreadsheet_is_named_as_one(
-    tmp_path: Path, form: str, ending: str, inside: str
-) -> None:
+def test_spreadsheets_are_named(tmp_path: Path, form: str, ending: str, inside: str) -> None:
     path = tmp_path / f"table.{ending}"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mimetype" if ending == "ods" else inside, inside)

@@ -1,4 +1,4 @@
-"""Changes during a run, by a script and by command: complete in themselves, and the same either way."""
+"""Changes during a run, by a script and by command: complete in themselves, and with equal effect."""
 
 import json
 from typing import Any
@@ -37,7 +37,7 @@ def refused(*changes: Any, **overrides: Any) -> ScenarioError:
     return error.value
 
 
-def test_change_of_link_is_its_model_from_then_on() -> None:
+def test_link_changes_hold_from_then_on() -> None:
     setup = scripted(LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}).setup("s")
     assert setup.links[0].models == (
         LinkModel(location=200_000.0),
@@ -56,7 +56,7 @@ def test_a_change_of_shares_is_a_ramp() -> None:
     assert scenario.setup("m1").ramps == ()
 
 
-def test_a_change_keeps_unnamed_keys_unless_it_names_a_kind() -> None:
+def test_changes_keep_unnamed_keys() -> None:
     base = {
         "model": "gamma",
         "delay_ms": 50.0,
@@ -76,7 +76,7 @@ def test_a_change_keeps_unnamed_keys_unless_it_names_a_kind() -> None:
     assert scenario.setup("s").links[0].outages == ((S, 2 * S),)
 
 
-def test_a_trace_may_be_left_but_no_other_begun() -> None:
+def test_traces_may_end_but_not_begin() -> None:
     base = {"model": "trace", "trace": "0 7000, 1000 9000"}
     left = [
         {"at_s": 1, "link": "m1->s", "to": {"loss": 0.5}},
@@ -97,7 +97,7 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "path", "words"),
+    ("change", "path", "phrase"),
     [
         (
             {**LINK, "link": "m1->ss"},
@@ -150,15 +150,13 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
         (5, "timeline[0]", "must be a table"),
     ],
 )
-def test_a_change_that_cannot_be_is_refused_with_its_path(
-    change: Any, path: str, words: str
-) -> None:
+def test_impossible_changes_are_refused_with_path(change: Any, path: str, phrase: str) -> None:
     error = refused(change)
     assert error.path == path
-    assert words in error.problem
+    assert phrase in error.problem
 
 
-def test_changes_stand_in_the_order_of_their_times() -> None:
+def test_changes_stand_in_time_order() -> None:
     assert scripted(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
     error = refused(ROW, LINK)
     assert error.path == "timeline[1].at_s"
@@ -174,14 +172,14 @@ def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> An
     return resolve_change(scenario, LinkTables(scenario.links, ()), written, from_ns)
 
 
-def test_command_holds_from_its_tick_and_belongs_to_receiver() -> None:
+def test_commands_hold_from_their_tick_at_receivers() -> None:
     scenario = load_scenario("paper")
     change = ordered(
         scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
     )
     assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
-    made = to_core_change(scenario, change)
-    assert (made.peer, made.model) == (
+    change_made = to_core_change(scenario, change)
+    assert (change_made.peer, change_made.model) == (
         0,
         LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
     )
@@ -194,20 +192,18 @@ def test_command_holds_from_its_tick_and_belongs_to_receiver() -> None:
 
 @settings(max_examples=60)
 @given(to=links(without=("trace",)), from_ns=st.integers(0, 10**14))
-def test_a_record_that_names_a_command_makes_the_same_command(
-    to: dict[str, Any], from_ns: int
-) -> None:
+def test_recorded_commands_are_restored(to: dict[str, Any], from_ns: int) -> None:
     scenario = load_scenario("paper")
     to.pop("outages_s", None)
-    made = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
-    assert parse_core_change(scenario, "m1", made.text) == made
-    assert made.model is not None
-    assert made.model.from_ns == from_ns
+    change = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
+    assert parse_core_change(scenario, "m1", change.text) == change
+    assert change.model is not None
+    assert change.model.from_ns == from_ns
 
 
 @pytest.mark.parametrize("change", [LINK, ROW], ids=["link", "shares"])
-def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) -> None:
-    """The same trajectories, bit for bit, and the record of its tick names it."""
+def test_commands_equal_the_script(change: dict[str, Any]) -> None:
+    """The same trajectories, bit for bit, and the record of its tick names the command."""
     at_ns = 300_000_000
     short = {
         "duration_s": 1.0,
@@ -221,20 +217,20 @@ def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) 
         load_scenario("free", {**short, "timeline": [script]}),
     )
     written = {key: value for key, value in script.items() if key != "at_s"}
-    made = to_core_change(plain, ordered(plain, written, at_ns))
+    change_made = to_core_change(plain, ordered(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
-    commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [made]}}))
+    commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [change_made]}}))
     scripted_run = list(virtual.execute_virtual(planned))
     assert [step.output._replace(cmd=[]) for step in commanded] == [
         step.output for step in scripted_run
     ]
     named = [step.output for step in commanded if step.output.cmd]
-    assert [(output.tick, output.cmd) for output in named] == [(k, [made.text])]
+    assert [(output.tick, output.cmd) for output in named] == [(k, [change_made.text])]
     assert commanded != list(virtual.execute_virtual(plain))
 
 
 @pytest.mark.parametrize(
-    ("written", "words"),
+    ("written", "phrase"),
     [
         ({"link": "m1->x", "to": {}}, "no link 'm1->x'"),
         ({"link": "m1->s", "dominance": "s"}, "must name either a link"),
@@ -243,12 +239,12 @@ def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) 
         ({"dominance": "s", "to": {"m1": 1}, "ramp_s": -1.0}, "ramp_s"),
     ],
 )
-def test_an_order_that_cannot_be_is_refused(written: dict[str, Any], words: str) -> None:
-    with pytest.raises(ScenarioError, match=words):
+def test_impossible_orders_are_refused(written: dict[str, Any], phrase: str) -> None:
+    with pytest.raises(ScenarioError, match=phrase):
         ordered(load_scenario("paper"), written)
 
 
-def test_a_link_with_a_trace_takes_no_unrecordable_orders() -> None:
+def test_links_with_traces_refuse_unrecordable_orders() -> None:
     scenario = load_scenario("paper", {"link": {"model": "trace", "trace": "0 7000"}})
     with pytest.raises(ScenarioError, match="can be changed only by setting another model"):
         ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
@@ -282,7 +278,7 @@ row = {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}}
         json.dumps({**row, "to": {"m1": 0.5}}),
     ],
 )
-def test_record_that_names_no_command_of_its_site_is_refused(text: str) -> None:
+def test_records_of_unknown_commands_are_refused(text: str) -> None:
     scenario = load_scenario("paper")
     for valid in (good, row):
         assert (

@@ -1,4 +1,4 @@
-"""What a site's user is shown of its peers: a link beside the haptic one, by scenario, seed and ticks."""
+"""The peers as shown to a site's user: a link beside the haptic one, by scenario, seed and ticks."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ MODELS = {
 
 @pytest.mark.parametrize("view", MODELS.values(), ids=MODELS)
 @pytest.mark.parametrize("peer_hz", [1000, 400])
-def test_a_picture_is_delayed_as_a_link_is(view: dict[str, Any], peer_hz: int) -> None:
+def test_pictures_are_delayed_like_links(view: dict[str, Any], peer_hz: int) -> None:
     scenario = load_scenario("paper", {"sites.m1.view": view, "sites.s.rate_hz": peer_hz})
     picture, model = PictureDelay(scenario, "m1"), scenario.sites["m1"].view
     assert model is not None
@@ -46,22 +46,22 @@ def test_a_picture_is_delayed_as_a_link_is(view: dict[str, Any], peer_hz: int) -
     assert [picture.advance_to(tick, {})["s"] for tick in range(2000)] == used.tolist()
 
 
-def test_who_looks_late_is_shown_the_same() -> None:
+def test_late_viewers_see_the_same() -> None:
     scenario = load_scenario("paper", {"sites.m1.view": MODELS["lossy gamma"], "rate_hz": 50})
     from_first, late = (PictureDelay(scenario, "m1") for _ in range(2))
-    shown = [from_first.advance_to(tick, {}) for tick in range(3000)]
-    assert [late.advance_to(tick, {}) for tick in range(2800, 3000)] == shown[2800:]
+    states = [from_first.advance_to(tick, {}) for tick in range(3000)]
+    assert [late.advance_to(tick, {}) for tick in range(2800, 3000)] == states[2800:]
 
 
-def test_nothing_is_shown_of_an_outage() -> None:
+def test_outages_show_nothing() -> None:
     view = {"delay_ms": 100.0, "outages_s": [[0.5, 1.0]]}
     picture = PictureDelay(load_scenario("paper", {"sites.m1.view": view}), "m1")
-    shown = np.array([picture.advance_to(tick, {})["s"] for tick in range(1500)])
-    assert shown[[599, 600, 1099, 1100]].tolist() == [499, 499, 499, 1000]
+    pictures = np.array([picture.advance_to(tick, {})["s"] for tick in range(1500)])
+    assert pictures[[599, 600, 1099, 1100]].tolist() == [499, 499, 499, 1000]
 
 
-def test_a_picture_has_no_influence_on_the_run() -> None:
-    """Every record stays, and the log tells what was shown."""
+def test_pictures_never_influence_the_run() -> None:
+    """Every record stays, and the log contains the shown samples."""
     keys = {"duration_s": 1.0, "rate_hz": 200}
     plain = tn.simulate("paper", keys)
     delayed = tn.simulate("paper", {**keys, "sites.m1.view.delay_ms": 250.0})
@@ -85,7 +85,7 @@ def test_a_picture_has_no_influence_on_the_run() -> None:
         (20.0, "sites.m1.view"),
     ],
 )
-def test_a_view_that_is_no_link_is_refused(view: Any, path: str) -> None:
+def test_an_invalid_view_link_is_refused(view: Any, path: str) -> None:
     with pytest.raises(ScenarioError) as refused:
         load_scenario("paper", {"sites.m1.view": view})
     assert refused.value.path == path

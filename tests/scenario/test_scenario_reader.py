@@ -1,4 +1,4 @@
-"""Scenarios: what loads runs, and what cannot be right is refused where it stands."""
+"""Scenarios: every loaded scenario runs, and mistakes are refused at their place."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_a_shipped_scenario_loads_and_is_called_by_its_name(name: str) -> None:
+def test_shipped_scenarios_are_called_by_name(name: str) -> None:
     scenario = load_scenario(name)
     assert scenario.name == name
     assert scenario.title
@@ -56,7 +56,7 @@ def test_paper_is_section_iv() -> None:
     assert m1.links[0].models == (LinkModel(location=200_000.0),)
 
 
-def test_template_is_valid_and_its_defaults_are_what_it_says() -> None:
+def test_templates_are_valid_with_their_defaults() -> None:
     scenario = parse_scenario(read_template(), "template")
     assert scenario.name == "mine"
     spelt_out = "\n".join(
@@ -68,7 +68,7 @@ def test_template_is_valid_and_its_defaults_are_what_it_says() -> None:
     assert scenario.sites["s"].limits.tau_limit_nm == 200.0
 
 
-def test_the_hash_names_the_experiment() -> None:
+def test_hashes_name_experiments() -> None:
     hashes = [load_scenario("paper").sha256, load_scenario("free").sha256]
     hashes += [
         load_scenario("paper", {key: 2}).sha256
@@ -105,8 +105,8 @@ def test_an_override_without_key_or_value_is_refused(text: str) -> None:
     assert "KEY=VALUE" in str(refused([text]))
 
 
-def test_override_that_names_kind_replaces_what_file_says_of_another() -> None:
-    """Whatever comes first; other overrides of the same table stay."""
+def test_kind_overrides_replace_other_kinds() -> None:
+    """In any order of keys; other overrides of the same table stay."""
     for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
         links = load_scenario("paper", texts).links.values()
         assert {link.describe() for link in links} == {
@@ -121,7 +121,7 @@ def test_override_that_names_kind_replaces_what_file_says_of_another() -> None:
     )
 
 
-def test_an_override_of_the_law_takes_that_laws_gains() -> None:
+def test_law_overrides_take_that_laws_gains() -> None:
     scenario = load_scenario("paper", ["control.law=p_d", "control.d=7"])
     gains = scenario.setup("m1").gains
     assert (gains.law, gains.K, gains.d) == (Law.KNOWN, (10.0, 10.0), (7.0, 7.0))
@@ -134,7 +134,7 @@ def test_an_override_of_the_law_takes_that_laws_gains() -> None:
     ]
 
 
-def test_what_to_do_about_a_stale_peer() -> None:
+def test_rules_for_stale_peers_are_read() -> None:
     assert load_scenario("paper").setup("s").on_stale == StaleRule(
         StaleAction.USE, 350_000_000, 1_000_000_000
     )
@@ -155,11 +155,11 @@ def test_what_to_do_about_a_stale_peer() -> None:
     assert "must be 'use' or 'hold' or 'brake'" in refused({"on_stale.action": "panic"}).problem
 
 
-def test_an_override_below_a_value_is_refused() -> None:
+def test_overrides_below_a_value_are_refused() -> None:
     assert refused(["seed.x=1"]).path == "seed"
 
 
-def test_an_override_reaches_into_lists_by_number() -> None:
+def test_overrides_reach_list_entries_by_number() -> None:
     wall = load_scenario("contact").sites["s"].environment[0]
     stiff = load_scenario(
         "contact", ["sites.s.environment.0.stiffness_n_m=500", "sites.s.q0_rad.1=0.5"]
@@ -172,9 +172,9 @@ def test_an_override_reaches_into_lists_by_number() -> None:
         {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5},
     )
     assert resolved == stiff
-    given: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
-    apply_overrides(given, ["a.0.b.1=5", "a.1.c=6"])
-    assert given == {"a": [{"b": [1, 5]}, {"c": 6}]}
+    tables: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
+    apply_overrides(tables, ["a.0.b.1=5", "a.1.c=6"])
+    assert tables == {"a": [{"b": [1, 5]}, {"c": 6}]}
 
 
 @pytest.mark.parametrize(
@@ -209,13 +209,13 @@ def test_an_override_reaches_into_lists_by_number() -> None:
         ),
     ],
 )
-def test_an_entry_that_is_not_in_a_list_is_refused(key: str, path: str, problem: str) -> None:
-    found = refused([f"{key}=1"], read_shipped("contact"))
-    assert found.path == path
-    assert problem in found.problem
+def test_entries_outside_a_list_are_refused(key: str, path: str, problem: str) -> None:
+    reason = refused([f"{key}=1"], read_shipped("contact"))
+    assert reason.path == path
+    assert problem in reason.problem
 
 
-def test_a_number_counts_for_every_joint_and_every_parameter() -> None:
+def test_single_numbers_apply_to_all_joints() -> None:
     control = load_scenario("paper", {"control.Kd": 5, "control.Gamma": 0.5}).sites["s"].control
     assert control.Kd == (5.0, 5.0)
     assert control.Gamma == (0.5,) * 5
@@ -225,7 +225,7 @@ def test_a_number_counts_for_every_joint_and_every_parameter() -> None:
     assert scenario.sites["m2"].control.Kp == (1.0, 1.0)
 
 
-def test_a_site_overrides_its_arm_and_a_link_its_delay() -> None:
+def test_sites_and_links_override_their_groups() -> None:
     scenario = load_scenario(
         "paper",
         {
@@ -257,21 +257,23 @@ def test_a_delay_is_rounded_to_whole_microseconds() -> None:
         )
 
 
-def test_without_hands_is_same_experiment_with_nobody_at_arms() -> None:
+def test_without_hands_the_experiment_is_free() -> None:
     scenario = load_scenario("paper").without_hands()
     assert all(spec.hands == () for spec in scenario.sites.values())
     assert scenario.setup("m1").actors == ()
     assert scenario.sites["m1"].control == load_scenario("paper").sites["m1"].control
 
 
-def test_shares_that_are_not_named_are_zero() -> None:
+def test_unnamed_shares_are_zero() -> None:
     scenario = load_scenario("paper", {"dominance.m1": {"s": 1}})
     assert scenario.alpha[0].tolist() == [0.0, 0.0, 1.0]
     assert scenario.beta is not None
 
 
-def test_a_reducible_matrix_loads_and_has_no_beta() -> None:
-    """Expert and slave locked, trainee following: it runs, and only the certificate is without weights."""
+def test_reducible_matrices_have_no_beta() -> None:
+    """Expert and slave locked, trainee following: the scenario runs, and only the certificate
+    is without weights.
+    """
     rows = {"m1": {"s": 1}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 1}}
     assert load_scenario("paper", {"dominance": rows}).beta is None
     assert np.allclose(load_scenario("asymmetric").beta, [0.426, 0.155, 0.419], atol=5e-4)
@@ -292,7 +294,7 @@ def test_a_reducible_matrix_loads_and_has_no_beta() -> None:
         ("links.m1->ss", "m1->s"),
     ],
 )
-def test_unknown_key_is_refused_with_its_path_and_nearest_name(key: str, nearest: str) -> None:
+def test_unknown_keys_name_the_nearest(key: str, nearest: str) -> None:
     table = {"links.m1->ss": {"delay_ms": 1.0}}.get(key, 1.0)
     error = refused({key: table})
     assert error.path == key
@@ -300,7 +302,7 @@ def test_unknown_key_is_refused_with_its_path_and_nearest_name(key: str, nearest
     assert f"did you mean '{nearest}'" in error.problem
 
 
-def test_a_key_unlike_any_other_is_refused_with_all_valid() -> None:
+def test_odd_keys_are_refused_with_valid_ones() -> None:
     assert "valid keys are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
 
 
@@ -332,9 +334,7 @@ def test_a_key_unlike_any_other_is_refused_with_all_valid() -> None:
         ({"sites.recorder": {}}, "sites.recorder"),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_with_its_path(
-    overrides: dict[str, Any], path: str
-) -> None:
+def test_invalid_values_are_refused_with_path(overrides: dict[str, Any], path: str) -> None:
     error = refused(overrides)
     assert path in error.path
     assert error.problem
@@ -342,7 +342,7 @@ def test_a_value_that_cannot_be_is_refused_with_its_path(
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("key", ["duration_s", "dominance.m1.m2", "sites.s.q0_rad"])
-def test_a_number_that_is_not_finite_is_refused(key: str, value: float) -> None:
+def test_infinite_numbers_are_refused(key: str, value: float) -> None:
     error = refused({key: value})
     assert error.path == key
     assert "finite" in error.problem
@@ -350,7 +350,7 @@ def test_a_number_that_is_not_finite_is_refused(key: str, value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "words"),
+    ("row", "phrase"),
     [
         ({"m2": 0.5, "s": 0.4}, "sum to 0.9"),
         ({"m2": 0.5, "s": 0.5 + 1e-8}, "sum to 1"),
@@ -359,11 +359,11 @@ def test_a_number_that_is_not_finite_is_refused(key: str, value: float) -> None:
         ({}, "sum to 0"),
     ],
 )
-def test_rows_of_alpha_are_checked(row: dict[str, float], words: str) -> None:
+def test_rows_of_alpha_are_checked(row: dict[str, float], phrase: str) -> None:
     """Eq. (7), to 1e-9."""
     error = refused({"dominance.m1": row})
     assert error.path == "dominance.m1"
-    assert words in error.problem
+    assert phrase in error.problem
 
 
 @pytest.mark.parametrize(
@@ -380,22 +380,22 @@ def test_rows_of_alpha_are_checked(row: dict[str, float], words: str) -> None:
         ),
     ],
 )
-def test_what_is_missing_is_named(text: str, path: str) -> None:
+def test_missing_keys_are_named(text: str, path: str) -> None:
     assert refused((), text).path == path
 
 
-def test_the_smallest_scenario_is_two_sites_and_a_delay() -> None:
+def test_two_sites_and_delays_suffice() -> None:
     text = 'name = "a"\n[link]\ndelay_ms = 3\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }\nb = { a = 1 }'
     scenario = parse_scenario(text)
     assert (scenario.duration_s, scenario.sites["a"].rate_hz) == (20.0, 1000)
 
 
-def test_arm_whose_inertia_is_singular_in_some_pose_is_refused() -> None:
+def test_singular_arm_inertias_are_refused() -> None:
     """Property 1 does not hold for a massless first link with a point mass at the tip of the second."""
     assert refused({"arm.lc1_m": 0.0, "arm.I1_kg_m2": 0.0}).path.endswith("arm")
 
 
-def test_text_that_is_no_toml_is_refused() -> None:
+def test_other_text_than_toml_is_refused() -> None:
     assert "is not TOML" in str(refused((), "name = "))
 
 
@@ -408,20 +408,20 @@ def test_files_are_read_by_path(tmp_path: Path) -> None:
     assert load_scenario(scenario, {"seed": 5}).seed == 5
 
 
-def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     latin = tmp_path / "latin.toml"
     latin.write_bytes("title = 'Stärke'".encode("latin-1"))
-    for path, words in (
+    for path, reason in (
         (tmp_path / "none.toml", "No such file"),
         (tmp_path, "is a folder"),
         (latin, "not UTF-8"),
     ):
-        with pytest.raises(ScenarioError, match=words) as error:
+        with pytest.raises(ScenarioError, match=reason) as error:
             load_scenario(path)
         assert str(path) in str(error.value)
 
 
-def test_name_that_is_not_shipped_is_refused_with_nearest() -> None:
+def test_unknown_scenarios_name_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'paper'") as error:
         load_scenario("papre")
     assert "./mine.toml" in str(error.value)

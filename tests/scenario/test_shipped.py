@@ -1,4 +1,4 @@
-"""What the shipped scenarios say of themselves, beyond what their [expect] asks: the contrasts."""
+"""The shipped scenarios show their contrasts, beyond their [expect] tables."""
 
 from typing import Any
 
@@ -9,34 +9,34 @@ from tests.virtual_runs import Run, trajectories
 from trilat_net.scenario import load_scenario
 
 
-def ran(name: str, overrides: dict[str, Any] | None = None) -> Run:
+def run_shipped(name: str, overrides: dict[str, Any] | None = None) -> Run:
     return trajectories(load_scenario(name, {"expect": {}, **(overrides or {})}))
 
 
 def ages(run: Run) -> np.ndarray:
     used = run.stack("used")
     ticks = np.arange(used.shape[1])[None, :, None]
-    made: np.ndarray = (ticks - used)[used >= 0]
-    return made
+    age_ticks: np.ndarray = (ticks - used)[used >= 0]
+    return age_ticks
 
 
 @pytest.mark.long
-def test_4g_looks_young_because_newer_samples_overtake() -> None:
+def test_newer_samples_overtake_on_4g() -> None:
     short = {"duration_s": 6.0}
-    assert ages(ran("4g", short)).mean() == pytest.approx(21, abs=3)
-    assert ages(ran("4g", {**short, "link.order": "in_order"})).mean() > 400
+    assert ages(run_shipped("4g", short)).mean() == pytest.approx(21, abs=3)
+    assert ages(run_shipped("4g", {**short, "link.order": "in_order"})).mean() > 400
 
 
 @pytest.mark.long
 def test_handover_changes_sides_without_a_step() -> None:
-    made = ran("handover", {"duration_s": 13.1})
-    m1, m2, s = (made.sites[name].q[:, 0] for name in ("m1", "m2", "s"))
+    run = run_shipped("handover", {"duration_s": 13.1})
+    m1, m2, s = (run.sites[name].q[:, 0] for name in ("m1", "m2", "s"))
     beyond = s - (m1 + m2) / 2
     assert beyond[9900] > 0.14
     assert beyond[13_000] < -0.16
-    steps = np.abs(np.diff(made.sites["s"].q_des, axis=0))
+    steps = np.abs(np.diff(run.sites["s"].q_des, axis=0))
     assert steps.max() < 1e-3
-    q_des, qd_des = made.sites["s"].q_des, made.sites["s"].qd_des
+    q_des, qd_des = run.sites["s"].q_des, run.sites["s"].qd_des
     central = (q_des[2:] - q_des[:-2]) / 2e-3
     ramp = slice(10_010, 11_990)
     assert np.abs(central[ramp] - qd_des[1:-1][ramp]).max() < 1e-3

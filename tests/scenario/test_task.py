@@ -14,7 +14,7 @@ TEXT = planar_task()
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("changes", "path", "phrase"),
     [
         (
             {"sites.s.q0_rad": [0.1, 0.0]},
@@ -49,16 +49,16 @@ TEXT = planar_task()
         ({"sites.m.arm.base_xyz_m": [0, 0]}, "sites.m.arm.base_xyz_m", "length"),
     ],
 )
-def test_a_mistake_of_a_task_is_refused_at_its_key(
-    changes: dict[str, Any], path: str, words: str
+def test_task_mistakes_are_refused_at_their_key(
+    changes: dict[str, Any], path: str, phrase: str
 ) -> None:
     with pytest.raises(ScenarioError) as refused:
         parse_scenario(TEXT, overrides=changes)
-    assert (refused.value.path, words in refused.value.problem) == (path, True), refused.value
+    assert (refused.value.path, phrase in refused.value.problem) == (path, True), refused.value
 
 
 @pytest.mark.parametrize(
-    ("name", "key", "value", "words"),
+    ("name", "key", "value", "phrase"),
     [
         ("free", "arm.base_xyz_m", [1, 0, 0], "all arms are planar"),
         ("free", "arm.base_rpy_rad", [1, 0, 0], "all arms are planar"),
@@ -66,14 +66,14 @@ def test_a_mistake_of_a_task_is_refused_at_its_key(
         ("free", "task.singular_value", 0.3, "sites share joint angles"),
     ],
 )
-def test_a_key_without_effect_is_refused(name: str, key: str, value: Any, words: str) -> None:
-    with pytest.raises(ScenarioError, match=words) as refused:
+def test_a_key_without_effect_is_refused(name: str, key: str, value: Any, phrase: str) -> None:
+    with pytest.raises(ScenarioError, match=phrase) as refused:
         load_scenario(name, {key: value})
     assert refused.value.path == f"sites.m1.{key}"
 
 
-def test_an_arm_that_gravity_does_not_turn_is_accepted() -> None:
-    """Its first axis is along gravity: it is weightless there, and learns nothing of it."""
+def test_arms_unturned_by_gravity_are_accepted() -> None:
+    """The first axis is along gravity: gravity makes no torque about it, and nothing is learnt there."""
     scenario = load_scenario("unlike_arms", {"sites.s.arm.down": [0.0, 0.0, 5.0]})
     chain = scenario.arms["s"].chain
     assert chain is not None
@@ -81,7 +81,7 @@ def test_an_arm_that_gravity_does_not_turn_is_accepted() -> None:
 
 
 @pytest.mark.parametrize(("elbow_rad", "damped"), [(0.01, True), (1.7, False)])
-def test_a_start_near_a_singular_pose_is_told(elbow_rad: float, damped: bool) -> None:
+def test_start_near_a_singular_pose_is_reported(elbow_rad: float, damped: bool) -> None:
     """The least singular value of a two-link arm of equal lengths, from its determinant sin q2."""
     lines = describe_scenario(parse_scenario(planar_task(elbow_rad=elbow_rad)))
     (line,) = [line for line in lines if line.startswith("s follows along x, y")]

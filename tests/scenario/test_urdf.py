@@ -1,4 +1,4 @@
-"""Arms from URDF: what is read, against NumPy; what is refused, and by which words."""
+"""Arms from URDF: the parsed arm against NumPy; refusals and their words."""
 
 import copy
 import json
@@ -74,8 +74,8 @@ def refusal(text: str, **ends: str) -> str:
 
 
 @pytest.mark.parametrize(("text", "name", "n"), [(ARM6, "arm6", 6), (ARM7, "arm7", 7)])
-def test_the_shipped_arms_are_those_of_the_references(text: str, name: str, n: int) -> None:
-    """Bit for bit: the references were made of the files as they are."""
+def test_shipped_arms_equal_the_references(text: str, name: str, n: int) -> None:
+    """Bit for bit: the references were made from these files."""
     chain = read_urdf(text)
     stored = chain_references()[name].chain
     assert (chain.tip, len(chain.joints), chain.notes) == ("flange", n, ())
@@ -94,7 +94,7 @@ def test_the_shipped_arms_are_those_of_the_references(text: str, name: str, n: i
     assert all(math.isfinite(j.effort_limit) and j.lower < j.upper for j in chain.joints)
 
 
-def test_the_references_are_one_power_balance_and_one_position() -> None:
+def test_references_balance_power_and_position() -> None:
     """r'tau = (Y'r)'pi; the Jacobian's columns are r = z x (x - p), by NumPy; the file is small."""
     assert PATH.stat().st_size <= 200_000
     assert json.loads(PATH.read_text())["source"].startswith("Pinocchio")
@@ -126,7 +126,7 @@ def walk(chain: UrdfChain, q: Array) -> tuple[Array, Array, list]:
 
 
 def turn(axis: Array, angle: float) -> Array:
-    """Rodrigues."""
+    """Returns the rotation matrix by Rodrigues' formula."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
@@ -159,24 +159,29 @@ def stated(masses: Array, places: Array, angles: Array) -> str:
     inertia = " ".join(
         f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True)
     )
-    origin, mass = f'xyz="{words(c)}" rpy="{words(angles)}"', float(masses.sum())
+    origin, mass = (
+        f'xyz="{format_vector(c)}" rpy="{format_vector(angles)}"',
+        float(masses.sum()),
+    )
     return (
         f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
     )
 
 
-def words(vector: Array) -> str:
+def format_vector(vector: Array) -> str:
     return " ".join(repr(float(x)) for x in vector)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
-def test_fixed_links_and_payload_are_lumped_and_fixed_frames_composed(seed: int) -> None:
-    """Every body is a cloud of masses: what is read must be the cloud's own sums in the joint's frame."""
+def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
+    """Every body is a cloud of masses: the parsed body must have the cloud's own sums in the
+    joint's frame.
+    """
     random = np.random.default_rng(seed)
     angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
     origins = [
-        f'<origin xyz="{words(x)}" rpy="{words(a)}"/>'
+        f'<origin xyz="{format_vector(x)}" rpy="{format_vector(a)}"/>'
         for x, a in zip(offsets, angles, strict=True)
     ]
 
@@ -256,7 +261,7 @@ def test_limits_friction_and_kinds() -> None:
     )
 
 
-def test_gripper_is_held_at_zero_and_note_says_so() -> None:
+def test_grippers_are_held_at_zero_with_note() -> None:
     chain = read_urdf(GRIPPER, tip="tcp")
     assert [j.inertia[0] for j in chain.joints] == [4.0, 6.0]
     assert [re.findall("'(.*?)'", note) for note in chain.notes] == [
@@ -268,7 +273,7 @@ def test_gripper_is_held_at_zero_and_note_says_so() -> None:
     assert len(shorter.notes) == 3
 
 
-def test_a_base_or_a_tip_within_a_robot() -> None:
+def test_base_and_tip_within_a_robot() -> None:
     whole = read_urdf(ARM7)
     part = read_urdf(ARM7, base="link2", tip="link5")
     assert [j.name for j in part.joints] == ["joint3", "joint4", "joint5"]
@@ -276,7 +281,7 @@ def test_a_base_or_a_tip_within_a_robot() -> None:
     assert part.tip_origin_m == (0.0, 0.0, 0.0)
 
 
-def test_files_that_the_text_names_are_not_opened() -> None:
+def test_files_named_in_the_text_stay_closed() -> None:
     mesh = '<visual><geometry><mesh filename="package://nowhere/a.dae"/></geometry></visual>'
     assert read_urdf(
         TWO.replace('<link name="upper">', f'<link name="upper">{mesh}')
@@ -287,7 +292,7 @@ def test_files_that_the_text_names_are_not_opened() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "phrases"),
     [
         ('<mass value="2"/>', '<mass value="-2"/>', ["link 'upper'", "-2 kg"]),
         ('<mass value="2"/>', '<mass value="0"/>', ["link 'upper'", "no mass"]),
@@ -337,17 +342,15 @@ def test_files_that_the_text_names_are_not_opened() -> None:
         ),
     ],
 )
-def test_a_mistake_is_refused_with_its_place_and_the_remedy(
-    old: str, new: str, words: list[str]
-) -> None:
+def test_mistakes_are_refused_with_a_remedy(old: str, new: str, phrases: list[str]) -> None:
     assert old in TWO
     text = TWO.replace(old, new) if old == "robot" else TWO.replace(old, new, 1)
     message = refusal(text)
-    assert [word for word in words if word not in message] == []
+    assert [word for word in phrases if word not in message] == []
 
 
 @pytest.mark.parametrize(
-    ("text", "ends", "words"),
+    ("text", "ends", "phrases"),
     [
         (TWO, {"base": "bass"}, ["'bass'", "did you mean 'base'"]),
         (TWO, {"tip": "lowr"}, ["'lowr'", "did you mean 'lower'"]),
@@ -361,11 +364,9 @@ def test_a_mistake_is_refused_with_its_place_and_the_remedy(
         (GRIPPER.replace("prismatic", "planar"), {"tip": "finger"}, ["joint 'left'", "planar"]),
     ],
 )
-def test_ends_that_make_no_arm_are_refused_by_name(
-    text: str, ends: dict, words: list[str]
-) -> None:
+def test_ends_without_arm_are_refused(text: str, ends: dict, phrases: list[str]) -> None:
     message = refusal(text, **ends)
-    assert [word for word in words if word not in message] == []
+    assert [word for word in phrases if word not in message] == []
 
 
 def test_thirteen_joints_are_one_too_many() -> None:
@@ -419,7 +420,7 @@ _NASTY = st.sampled_from(
 
 
 def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
-    """One element or attribute dropped, doubled, garbled or scaled."""
+    """Drops, doubles, garbles or scales one element or attribute."""
     parents = [e for e in root.iter() if len(e)]
     parent = data.draw(st.sampled_from(parents))
     child = data.draw(st.sampled_from(list(parent)))
@@ -450,14 +451,16 @@ def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
 
 
 def garble(text: str, data: st.DataObject) -> str:
-    """A stretch of the text cut out, or characters put in."""
+    """Cuts out a stretch of the text, or inserts characters."""
     start = data.draw(st.integers(0, len(text)))
     end = data.draw(st.integers(start, min(len(text), start + 80)))
     return text[:start] + data.draw(st.text('<>/="& \n.0-eé\x00', max_size=4)) + text[end:]
 
 
 def check_physical(chain: UrdfChain) -> None:
-    """A chain that can be: bodies with a positive pseudo-inertia, right-handed frames, limits in order."""
+    """Asserts a physical chain: bodies with a positive pseudo-inertia, right-handed frames,
+    limits in order.
+    """
     assert 1 <= len(chain.joints) <= 12
     for j in chain.joints:
         assert all(map(math.isfinite, (*j.axis, *j.origin_m, *j.inertia, j.viscous, j.coulomb)))
@@ -481,9 +484,7 @@ def check_physical(chain: UrdfChain) -> None:
 
 @given(data=st.data(), source=st.sampled_from([(ARM6, ""), (ARM7, ""), (GRIPPER, "tcp")]))
 @settings(max_examples=200)
-def test_a_mutated_file_is_refused_with_its_place_or_physical(
-    data: st.DataObject, source: tuple
-) -> None:
+def test_mutated_files_are_refused_or_physical(data: st.DataObject, source: tuple) -> None:
     text, tip = source
     if data.draw(st.booleans()):
         text = garble(text, data)

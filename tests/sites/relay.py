@@ -1,8 +1,9 @@
-"""Many members on one clock, one at a time: live loops beside each other, and yet the same run every time.
+"""Many members on one clock, one at a time: live loops beside each other, with the same run
+every time.
 
-Whoever sleeps hands over to the one whose deadline is next; equal deadlines go in order of joining. Work
-takes no time, so that nobody is ever late, unless a test says `stall`. Members are greenlets of one thread:
-to hand over costs less than a microsecond.
+A member that sleeps hands over to the member whose deadline is next; equal deadlines go in
+order of joining. Work takes no time, so that no member is ever late, unless a test uses
+`stall`. Members are greenlets of one thread: to hand over costs less than a microsecond.
 """
 
 import heapq
@@ -15,7 +16,7 @@ LONGEST_NS = 3_600 * 10**9
 
 
 class Relay:
-    """Time shared by runners, of which one at a time runs; between them things happen by themselves."""
+    """Time shared by runners, of which one runs at a time; events happen between them."""
 
     def __init__(
         self, start_ns: int = 10**9, epoch_unix_ns: int = 1_700_000_000_000_000_000
@@ -64,7 +65,7 @@ class Relay:
         self._deadlines[seat] = max(at_ns, self.now_ns)
 
     def _pass_time(self, seat: int) -> None:
-        """It is this runner's turn: time goes on to its deadline, and what happens until then does."""
+        """Advances the time to this runner's deadline, and runs the events until then."""
         deadline_ns = self._deadlines[seat]
         while self._happenings and self._happenings[0][0] <= deadline_ns:
             at_ns, _, act = heapq.heappop(self._happenings)
@@ -75,7 +76,7 @@ class Relay:
             raise TimeoutError("an hour has passed: somebody waits for what never comes")
 
     def sleep(self, seat: int, deadline_ns: int) -> None:
-        """Returns when nobody else has anything to do before this runner's deadline."""
+        """Returns when no other runner has a deadline before this runner's."""
         self._deadlines[seat] = max(deadline_ns, self.now_ns)
         if (following := self._next()) != seat:
             self._runners[following].switch()
@@ -89,7 +90,7 @@ class Relay:
 
 
 class Killed(Exception):  # noqa: N818 - it is no error of the program
-    """Ends a runner wherever it sleeps."""
+    """Ends a runner at its next sleep."""
 
 
 class RelayClock:
@@ -106,7 +107,7 @@ class RelayClock:
         self._relay.set_start(self._seat, at_ns)
 
     def stall(self, at_ns: int, for_ns: int) -> None:
-        """The first sleep that would end at a time or after it ends so much later."""
+        """Delays the end of the first sleep that would end at or after a time."""
         self._stalls.append((at_ns, for_ns))
 
     def at(self, at_ns: int, act: Callable[[], None]) -> None:

@@ -168,7 +168,7 @@ class Session:
         self.clocks[name].at(at_ns, lambda: setattr(interrupt, "number", number))
 
     def lose(self, by: str, lost: str, from_ns: int, to_ns: int) -> None:
-        """Loses what is published under a key between two times; `by` is a site that lives then."""
+        """Loses messages under a key between two times; `by` is a site that lives then."""
 
         def begin() -> None:
             for member in self.network.members:
@@ -181,7 +181,9 @@ class Session:
 
     def lose_token(self, name: str) -> None:
         for member in self.network.members:
-            for token in [one for one in member._tokens if f"/{name}/alive/" in one]:
+            for token in [
+                live_token for live_token in member._tokens if f"/{name}/alive/" in live_token
+            ]:
                 member._tokens.remove(token)
                 member._notify(token, False)
 
@@ -200,7 +202,9 @@ class Session:
         )
 
     def play(self) -> None:
-        """Runs it in this process, which is left as it is: no real-time priority, no locked memory."""
+        """Runs the session in this process, which keeps its settings: no real-time priority, no
+        locked memory.
+        """
         obtained = dict.fromkeys(("scheduling", "memory"), "as it was")
         with mock.patch.object(realtime, "prepare", return_value=obtained):
             self.relay.run()

@@ -1,4 +1,4 @@
-"""Changes that a running site is asked for."""
+"""Changes requested from a running site."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ STOP = topics.key(SESSION, "s", topics.STOP)
 
 
 class Asked:
-    """A site `s` that listens, and somebody who asks it."""
+    """A site `s` that listens, and a member that requests changes."""
 
     def __init__(
         self, scenario: Scenario | None = None, mode: Callable[[], Mode] = lambda: Mode.RUN
@@ -48,24 +48,24 @@ class Asked:
 
 
 @given(st.integers(0, 10_000))
-def test_an_accepted_change_names_its_first_tick_and_is_recorded(k: int) -> None:
-    """What the next record says makes the same command again; it holds from the tick of the answer on."""
-    asked = Asked()
-    (taken,), reply = asked.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
+def test_accepted_changes_name_their_recorded_first_tick(k: int) -> None:
+    """The next record repeats the command, which holds from the tick of the answer on."""
+    requests = Asked()
+    (taken,), reply = requests.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
     assert reply.accepted
     assert reply.tick == k + AHEAD_MS
-    assert parse_core_change(asked.scenario, "s", taken.text) == taken
+    assert parse_core_change(requests.scenario, "s", taken.text) == taken
     assert taken.model is not None
     assert (taken.peer, taken.model.from_ns) == (0, reply.tick * 1_000_000)
     assert (taken.model.location, taken.model.loss_good) == (350_000.0, 0.05)
 
 
-def test_a_change_leaves_unnamed_keys_as_the_timeline_has_them() -> None:
+def test_changes_leave_unnamed_keys_unchanged() -> None:
     later = {"at_s": 1.0, "link": "m1->s", "to": {"loss": 0.25}}
-    asked = Asked(load_scenario("paper", {"timeline": [later]}))
-    (before,), _ = asked.ask(10, link="m1->s", to={"duplicate": 0.5})
-    (after,), _ = asked.ask(1000, link="m1->s", to={"delay_ms": 10.0})
-    (last,), _ = asked.ask(1001, link="m1->s", to={"playout_ms": 20.0})
+    requests = Asked(load_scenario("paper", {"timeline": [later]}))
+    (before,), _ = requests.ask(10, link="m1->s", to={"duplicate": 0.5})
+    (after,), _ = requests.ask(1000, link="m1->s", to={"delay_ms": 10.0})
+    (last,), _ = requests.ask(1001, link="m1->s", to={"playout_ms": 20.0})
     models = [taken.model for taken in (before, after, last)]
     assert [m and (m.location, m.loss_good, m.duplicate, m.playout_us) for m in models] == [
         (200_000.0, 0.0, 0.5, 0),
@@ -74,13 +74,13 @@ def test_a_change_leaves_unnamed_keys_as_the_timeline_has_them() -> None:
     ]
 
 
-def test_shares_are_ramped_from_the_first_tick_on() -> None:
+def test_shares_are_ramped_from_the_first_tick() -> None:
     (taken,), reply = Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=2.0)
     first_ns = reply.tick * 1_000_000
     assert taken.ramp == (first_ns, first_ns + 2_000_000_000, (0.9, 0.1))
 
 
-def test_dominance_is_ramped_whatever_sender_asks_and_record_says_so() -> None:
+def test_dominance_is_ramped_for_every_sender() -> None:
     (taken,), _ = Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=0.0)
     assert taken.ramp is not None
     assert taken.ramp.end_ns - taken.ramp.start_ns == round(MIN_RAMP_S * 1e9)
@@ -88,17 +88,17 @@ def test_dominance_is_ramped_whatever_sender_asks_and_record_says_so() -> None:
     assert not Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=-1.0)[1].accepted
 
 
-def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
+def test_triangle_drags_of_a_minute_are_obeyed() -> None:
     """Thirty orders a second, as a page sends them; a flood within the time before they hold is refused."""
-    asked = Asked()
-    site = Site(asked.scenario.setup("s"))
+    requests = Asked()
+    site = Site(requests.scenario.setup("s"))
     for n in range(1800):
-        (taken,), _ = asked.ask(
+        (taken,), _ = requests.ask(
             10 * n, dominance="s", to={"m1": 0.5 + n / 4000, "m2": 0.5 - n / 4000}
         )
         site.apply_change(taken, 10 * n * 1_000_000)
     replies = [
-        asked.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1]
+        requests.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1]
         for _ in range(MAX_RAMPS + 1)
     ]
     assert [reply.accepted for reply in replies] == [True] * MAX_RAMPS + [False]
@@ -117,7 +117,9 @@ def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
         ({"to": {}}, "must name either a link"),
     ],
 )
-def test_what_cannot_be_is_refused_with_the_reason(order: Mapping[str, Any], says: str) -> None:
+def test_impossible_changes_are_refused_with_the_reason(
+    order: Mapping[str, Any], says: str
+) -> None:
     taken, reply = Asked().ask(5, **order)
     assert taken == []
     assert not reply.accepted
@@ -128,13 +130,15 @@ GLIDES = load_scenario("free", {"on_stale.action": "glide"})
 
 
 def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
-    """Which orders a site that waits accepts, and its mode in the end; a batch is asked in one tick."""
+    """Returns the orders that a waiting site accepts, and its final mode; a batch is requested
+    in one tick.
+    """
     site, mode, replies = Site(GLIDES.setup("s")), Mode.WAITING, []
-    asked = Asked(GLIDES, lambda: mode)
+    requests = Asked(GLIDES, lambda: mode)
     for k in range(20):
         batch = batches[k] if k < len(batches) else ()
-        replies += [asked.send(encode(ChangeRequest(order=order))) for order in batch]
-        mode = site.step(TickInput(k, commands=list(asked.changes.pop_changes(k)))).mode
+        replies += [requests.send(encode(ChangeRequest(order=order))) for order in batch]
+        mode = site.step(TickInput(k, commands=list(requests.changes.pop_changes(k)))).mode
     answers = [answer for reply in replies if (answer := reply.poll())]
     assert len(answers) == len(replies)
     return [decode(answer[1], ChangeReply).accepted for answer in answers], mode
@@ -142,47 +146,47 @@ def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
 
 @given(st.lists(st.sampled_from(["stop", "enable", "reset"]), min_size=1, max_size=6))
 def test_orders_of_one_tick_act_as_in_several(orders: list[str]) -> None:
-    """`enable` behind a `stop` of the same tick was refused: the site was not stopped yet."""
+    """`enable` behind a `stop` of the same tick used to be refused: the site was not stopped yet."""
     assert obey([orders]) == obey([[order] for order in orders])
 
 
-def test_a_client_of_another_version_is_refused_with_both_versions() -> None:
+def test_clients_of_other_versions_are_refused() -> None:
     taken, reply = Asked().ask(0, v=99, link="m1->s", to={"delay_ms": 1.0})
     assert taken == []
     assert "99" in reply.text
 
 
-def test_what_is_no_order_is_answered_and_harmless() -> None:
-    asked = Asked()
-    replies = [asked.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
-    assert asked.changes.pop_changes(0) == []
+def test_invalid_orders_are_answered_and_harmless() -> None:
+    requests = Asked()
+    replies = [requests.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
+    assert requests.changes.pop_changes(0) == []
     assert all(
         (answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies
     )
 
 
-def test_change_that_run_does_not_live_to_see_is_refused() -> None:
+def test_changes_after_the_runs_end_are_refused() -> None:
     taken, reply = Asked().ask(19_950, link="m1->s", to={"delay_ms": 1.0})
     assert taken == []
     assert "20000" in reply.text
 
 
-def test_a_run_takes_a_bounded_number_of_changes() -> None:
+def test_changes_in_a_run_are_bounded() -> None:
     """L6: the site's tables hold every change that was accepted, and one more is refused."""
-    asked = Asked()
-    site = Site(asked.scenario.setup("s"))
+    requests = Asked()
+    site = Site(requests.scenario.setup("s"))
     for k in range(MAX_CHANGES):
-        (taken,), _ = asked.ask(k, link="m1->s", to={"delay_ms": float(k)})
+        (taken,), _ = requests.ask(k, link="m1->s", to={"delay_ms": float(k)})
         assert site.step(TickInput(k, (), [taken])).cmd == [taken.text]
-    assert asked.ask(MAX_CHANGES, link="m1->s", to={"delay_ms": 1.0})[0] == []
+    assert requests.ask(MAX_CHANGES, link="m1->s", to={"delay_ms": 1.0})[0] == []
 
 
-def test_a_mark_changes_nothing_and_waits_for_the_next_event() -> None:
-    asked = Asked()
-    taken, reply = asked.ask(7, mark="the wall")
+def test_marks_change_nothing_and_wait_for_events() -> None:
+    requests = Asked()
+    taken, reply = requests.ask(7, mark="the wall")
     assert (taken, reply.accepted, reply.tick) == ([], True, 7)
-    assert asked.changes.marks == [(7, "the wall")]
-    replies = [asked.ask(8, mark=str(n))[1] for n in range(MARKS_WAITING)]
+    assert requests.changes.marks == [(7, "the wall")]
+    replies = [requests.ask(8, mark=str(n))[1] for n in range(MARKS_WAITING)]
     assert [reply.accepted for reply in replies] == [True] * (MARKS_WAITING - 1) + [False]
 
 
@@ -197,40 +201,40 @@ def test_a_mark_changes_nothing_and_waits_for_the_next_event() -> None:
         {"order": "stop", "mark": "x"},
     ],
 )
-def test_the_key_of_every_member_allows_stop_alone(more: dict[str, Any]) -> None:
-    asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
-    garbage = asked.send(b"garbage", STOP)
-    taken, reply = asked.ask(10, STOP, **more)
+def test_every_members_key_allows_stop_only(more: dict[str, Any]) -> None:
+    requests = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
+    garbage = requests.send(b"garbage", STOP)
+    taken, reply = requests.ask(10, STOP, **more)
     assert (taken, reply.accepted) == ([], False)
     assert "only requests to stop" in reply.text
     assert (answer := garbage.poll()) is not None
     assert not decode(answer[1], ChangeReply).accepted
-    (change,), reply = asked.ask(11, STOP, order="stop")
+    (change,), reply = requests.ask(11, STOP, order="stop")
     assert reply.accepted
     assert '"order":"stop"' in change.text
 
 
-def test_who_orders_is_kept_until_an_event_says_it() -> None:
-    asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
-    (taken,), reply = asked.ask(5, STOP, order="stop", source="the experimenter")
+def test_orderers_are_kept_until_an_event() -> None:
+    requests = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
+    (taken,), reply = requests.ask(5, STOP, order="stop", source="the experimenter")
     assert reply.accepted
-    assert asked.changes.sources == {taken.text: "the experimenter"}
+    assert requests.changes.sources == {taken.text: "the experimenter"}
     assert "experimenter" not in taken.text  # the record, and so every execution, is the same
-    (other,), _ = asked.ask(6, STOP, order="stop")
-    assert other.text not in asked.changes.sources
+    (other,), _ = requests.ask(6, STOP, order="stop")
+    assert other.text not in requests.changes.sources
 
 
-def test_a_mark_does_not_claim_a_change() -> None:
-    asked = Asked()
+def test_marks_claim_no_change() -> None:
+    requests = Asked()
     for order in (
         {"link": "m1->s", "to": {"loss": 0.5}, "source": "m1"},
         {"mark": "here", "source": "m2"},
     ):
-        asked.send(encode(ChangeRequest(**order)))
-    (change,) = asked.changes.pop_changes(10)
-    assert asked.changes.sources == {change.text: "m1"}
+        requests.send(encode(ChangeRequest(**order)))
+    (change,) = requests.changes.pop_changes(10)
+    assert requests.changes.sources == {change.text: "m1"}
 
 
-def test_request_without_source_has_the_bytes_of_before() -> None:
+def test_request_without_source_has_the_old_bytes() -> None:
     """A site of an older program refuses a field that it does not know."""
     assert b"source" not in encode(ChangeRequest(order="stop"))

@@ -1,10 +1,10 @@
-"""Members on clocks of their own make the same run, and know where they stand; wall clocks decide nothing."""
+"""Members on different clocks make the same run, and know their offsets; wall clocks decide nothing."""
 
 from pathlib import Path
 
 import pytest
 
-from tests.truth import judged, members, offset_errors
+from tests.truth import judge_link, members, offset_errors
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
@@ -48,7 +48,7 @@ def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log])
 @pytest.mark.parametrize(
     "names", [("m2",), pytest.param(("m1", "recorder"), marks=pytest.mark.long)]
 )
-def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Path) -> None:
+def test_any_members_clock_may_differ(names: tuple[str, ...], tmp_path: Path) -> None:
     skews = {**SKEWS, "m1": (7 * S, 60_000)}
     session, log = run(tmp_path, {name: skews[name] for name in names}, 0.3)
     assert log.complete
@@ -59,12 +59,12 @@ def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Pat
     assert max(begun_ns.values()) - min(begun_ns.values()) <= 200_000
 
 
-def test_delays_and_offsets_in_log_are_true_within_bound(skewed: tuple[Session, Log]) -> None:
-    """Here messages take no time: the bound is what the clocks can have drifted, soon microseconds."""
+def test_logged_delays_and_offsets_are_within_bounds(skewed: tuple[Session, Log]) -> None:
+    """Here messages take no time: the bound is the possible drift of the clocks, soon microseconds."""
     _, log = skewed
     for site in log.sites:
         for peer in log.scenario.peers(site):
-            samples = judged(log, site, peer)
+            samples = judge_link(log, site, peer)
             assert len(samples.tick) > 2000
             assert samples.inside == 1.0
             assert samples.bound_us[-1] < 50.0
@@ -73,12 +73,12 @@ def test_delays_and_offsets_in_log_are_true_within_bound(skewed: tuple[Session, 
             assert abs(errors[-1, 2]) < 2.0
 
 
-def test_grids_follow_the_leaders_and_the_log_says_how(skewed: tuple[Session, Log]) -> None:
+def test_grids_follow_the_leaders_as_logged(skewed: tuple[Session, Log]) -> None:
     _, log = skewed
     clocks = members(log)
     for site, drift_ppb in (("m1", 0), ("m2", 100_000), ("s", -100_000)):
         stats = log.link_stats(site)
-        assert all(abs(one.grid_error_us) <= 150 for one in stats)
+        assert all(abs(statistics.grid_error_us) <= 150 for statistics in stats)
         assert abs(stats[-1].slew_ppb) <= 200_000
         assert stats[-1].slew_ppb == pytest.approx(drift_ppb, abs=30_000)
         last = log[site].states[-1]
@@ -86,11 +86,11 @@ def test_grids_follow_the_leaders_and_the_log_says_how(skewed: tuple[Session, Lo
         assert abs(late_ns) <= 60_000
 
 
-def test_people_are_told_whose_clock_is_another_one(skewed: tuple[Session, Log]) -> None:
+def test_members_on_other_clocks_are_reported(skewed: tuple[Session, Log]) -> None:
     session, log = skewed
-    told = [text for text in session.said if "another one" in text]
-    assert any(text.startswith("m1: clock of m2: another one, offset 3.0000") for text in told)
-    assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in told)
+    texts = [text for text in session.said if "another one" in text]
+    assert any(text.startswith("m1: clock of m2: another one, offset 3.0000") for text in texts)
+    assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in texts)
     setups = {event.member: event for event in log.events if event.kind == "setup"}
     assert "clock of m2: another one" in setups["s"].text
     assert setups["m2"].epoch_mono_ns == members(log)["m2"].epoch_ns
@@ -98,7 +98,7 @@ def test_people_are_told_whose_clock_is_another_one(skewed: tuple[Session, Log])
     assert all("turn: 0 us after the grid" in event.text for event in setups.values())
 
 
-def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) -> None:
+def test_on_one_clock_nothing_is_estimated(tmp_path: Path) -> None:
     session, log = run(tmp_path, {"recorder": SKEWS["recorder"]}, 0.2)
     assert not any(event.kind == "clock" for event in log.events)
     for site in log.sites:
@@ -152,7 +152,7 @@ def test_a_stepping_wall_clock_changes_only_labels(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "at_ns", [1_050_000_000, pytest.param(1_250_000_000, marks=pytest.mark.long)]
 )
-def test_a_hanging_member_on_another_clock_is_waited_for(at_ns: int, tmp_path: Path) -> None:
+def test_hanging_members_on_other_clocks_are_awaited(at_ns: int, tmp_path: Path) -> None:
     session = Session.whole(
         load_scenario("two_sites", {"duration_s": 0.3}), tmp_path, skews={"s": (S, 50_000)}
     )

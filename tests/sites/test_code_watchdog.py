@@ -1,4 +1,6 @@
-"""Code is too slow by its own computing time, never by the machine's lateness; one hiccup ends nothing."""
+"""Code counts as too slow by its own computing time, never by the machine's lateness; one
+hiccup ends nothing.
+"""
 
 import signal
 from collections.abc import Callable
@@ -26,7 +28,7 @@ TICKS = 3000
 
 
 class Steps:
-    """A site whose step takes a time that a test chooses, of which its thread computes a part."""
+    """A site whose step takes a time chosen by the test, of which its thread computes a part."""
 
     name, rate_hz = "s", 1000
 
@@ -53,7 +55,7 @@ def fail_of(site: str, law: str) -> Callable[[int, str], Exception]:
     return lambda k, problem: LawFailed(problem, site=site, code=law, tick=k)
 
 
-def ended(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
+def run_steps(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
     overtime = overtime or steps.overtime()
     for k in range(TICKS):
         try:
@@ -64,48 +66,48 @@ def ended(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.74, 0.8, 1.0, 2.0, 20.0, 100.0])
-def test_a_laws_overtime_adds_up_to_half_a_second(share: float) -> None:
+def test_a_laws_overtime_adds_up_to_500_ms(share: float) -> None:
     took_ns = int(share * PERIOD_NS)
     over_ns = min(took_ns, HICCUP_NS) - int(SHARE * PERIOD_NS)
-    k = ended(Steps(lambda _: took_ns))
+    k = run_steps(Steps(lambda _: took_ns))
     if over_ns <= 0 or OVERTIME_LIMIT_NS / over_ns > TICKS:
         assert k is None
     else:
         assert k == OVERTIME_LIMIT_NS // over_ns
 
 
-def test_a_law_slow_at_every_other_tick_is_found() -> None:
+def test_alternately_slow_laws_are_found() -> None:
     """2.5 periods and nothing, by turns: 1.25 on average, and never twice in a row."""
-    k = ended(Steps(lambda k: 2_500_000 * (k % 2)))
+    k = run_steps(Steps(lambda k: 2_500_000 * (k % 2)))
     assert k == pytest.approx(OVERTIME_LIMIT_NS / (0.5 * PERIOD_NS), abs=3)
 
 
 @pytest.mark.parametrize("hiccup_ns", [5_000_000, 300_000_000, 3_000_000_000])
-def test_a_single_hiccup_is_counted_and_no_more(hiccup_ns: int) -> None:
+def test_single_hiccups_are_only_counted(hiccup_ns: int) -> None:
     steps = Steps(lambda k: hiccup_ns if k == 700 else 200_000)
     overtime = steps.overtime()
-    assert ended(steps, overtime) is None
+    assert run_steps(steps, overtime) is None
     assert (overtime.hiccups, overtime.longest_tick, overtime.longest_ns) == (1, 700, hiccup_ns)
     assert "in 1 call;" in overtime.describe_hiccups()
 
 
-def test_machine_that_takes_processor_away_is_no_fault_of_law() -> None:
-    assert ended(Steps(lambda _: 5_000_000, computes=0.05, evicts=1)) is None
+def test_a_busy_machine_is_no_laws_fault() -> None:
+    assert run_steps(Steps(lambda _: 5_000_000, computes=0.05, evicts=1)) is None
 
 
-def test_a_law_that_waits_is_slow_although_it_computes_nothing() -> None:
-    assert ended(Steps(lambda _: 5_000_000, computes=0.0)) is not None
+def test_laws_that_wait_are_slow() -> None:
+    assert run_steps(Steps(lambda _: 5_000_000, computes=0.0)) is not None
 
 
-def test_a_law_that_keeps_up_has_nothing_told() -> None:
+def test_punctual_laws_get_no_report() -> None:
     steps = Steps(lambda _: 700_000)
     overtime = steps.overtime()
-    assert ended(steps, overtime) is None
+    assert run_steps(steps, overtime) is None
     assert overtime.describe_hiccups() == ""
 
 
 class Hanging:
-    """A law that does not come back, and lets nothing pass."""
+    """A law that never returns, and keeps the interpreter."""
 
     def __init__(self, _facts: object) -> None:
         self.caught = 0
@@ -118,7 +120,7 @@ class Hanging:
                 self.caught += 1
 
 
-def test_a_law_that_does_not_come_back_is_stopped() -> None:
+def test_a_hanging_law_is_stopped() -> None:
     site = Site(setup("s", "two_sites")._replace(law_factory=Hanging))
     before = signal.getsignal(signal.SIGALRM)
     watched = WatchedCode(
@@ -135,7 +137,7 @@ def test_a_law_that_does_not_come_back_is_stopped() -> None:
 
 
 def test_every_call_of_a_first_tick_may_compile() -> None:
-    """A plant is asked at its first tick where its bodies are, and then to move."""
+    """In its first tick a plant is asked for the places of its bodies, and then to move."""
     watched = WatchedCode(
         "the plant mine:Scene", 1000, fail_of("s", "mine:Scene"), SystemClock()
     )

@@ -1,4 +1,4 @@
-"""Processes of a session: each is what a shell would have started, and none is left, whoever dies first."""
+"""Processes of a session start like those of a shell, and none survives, whichever dies first."""
 
 import os
 import signal
@@ -29,7 +29,7 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessStarter
         yield starter
 
 
-def ended(starter: ProcessStarter, process: SessionProcess) -> SessionProcess:
+def wait_for_end(starter: ProcessStarter, process: SessionProcess) -> SessionProcess:
     until(lambda: starter.poll() or process.code is not None)
     return process
 
@@ -49,17 +49,21 @@ def parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
-def test_a_process_does_what_its_words_do(starter: ProcessStarter, tmp_path: Path) -> None:
-    shown = ended(starter, starter.start("show", ["scenario", "show", "paper"]))
-    refused = ended(starter, starter.start("site", ["site", "m9", "--scenario", "paper"]))
-    assert (shown.code, shown.problem()) == (0, None)
-    assert shown.output.read_text() == trilat("scenario", "show", "paper", cwd=tmp_path).out
+def test_processes_run_their_words(starter: ProcessStarter, tmp_path: Path) -> None:
+    show_process = wait_for_end(starter, starter.start("show", ["scenario", "show", "paper"]))
+    refused = wait_for_end(
+        starter, starter.start("site", ["site", "m9", "--scenario", "paper"])
+    )
+    assert (show_process.code, show_process.problem()) == (0, None)
+    assert (
+        show_process.output.read_text() == trilat("scenario", "show", "paper", cwd=tmp_path).out
+    )
     assert refused.code == 2
     assert "site ended with code 2: " in str(refused.problem())
     assert "m9" in str(refused.problem())
 
 
-def test_each_has_its_name_session_and_signals(starter: ProcessStarter) -> None:
+def test_processes_have_own_name_session_and_signals(starter: ProcessStarter) -> None:
     process = waiting(starter, "recorder")
     assert process.pid is not None
     assert (
@@ -69,24 +73,24 @@ def test_each_has_its_name_session_and_signals(starter: ProcessStarter) -> None:
     )
     assert os.getsid(process.pid) == process.pid
     process.end(signal.SIGINT)
-    assert (ended(starter, process).code, process.problem()) == (130, None)
+    assert (wait_for_end(starter, process).code, process.problem()) == (130, None)
     process.end(signal.SIGKILL)  # it has ended: nobody gets that
 
 
 def test_a_killed_process_is_named_with_its_signal(starter: ProcessStarter) -> None:
     process = waiting(starter, "m1")
     os.kill(int(process.pid or 0), signal.SIGKILL)
-    assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+    assert wait_for_end(starter, process).problem() == "m1 was killed by SIGKILL"
 
 
-def test_what_has_not_begun_is_ended_with_its_starter(tmp_path: Path) -> None:
+def test_unstarted_processes_end_with_their_starter(tmp_path: Path) -> None:
     with closing(started(tmp_path)) as starter:
         process = starter.start("m1", WAITS)
         process.end(signal.SIGINT)
-        assert ended(starter, process).problem() is None
+        assert wait_for_end(starter, process).problem() is None
 
 
-def test_interrupted_starter_that_ends_with_any_code_is_no_problem(tmp_path: Path) -> None:
+def test_interrupted_starters_are_no_problem(tmp_path: Path) -> None:
     """An interpreter that a signal meets while it imports its first modules ends with code 1."""
     with closing(started(tmp_path)) as starter:
         process = SessionProcess(starter, "m1", tmp_path / "m1.txt")
@@ -99,7 +103,7 @@ def test_interrupted_starter_that_ends_with_any_code_is_no_problem(tmp_path: Pat
         assert process.problem() is None
 
 
-def test_signal_that_meets_a_copy_before_its_handler_ends_it(tmp_path: Path) -> None:
+def test_signals_before_the_handler_end_copies(tmp_path: Path) -> None:
     """The starter forks and signals at once: none of ten copies loses the signal."""
     with closing(started(tmp_path)) as starter:
         waiting(starter, "recorder")  # the starter serves orders
@@ -107,34 +111,36 @@ def test_signal_that_meets_a_copy_before_its_handler_ends_it(tmp_path: Path) -> 
         for n in range(10):
             processes.append(starter.start(f"m{n}", WAITS))
             processes[-1].end(signal.SIGINT)
-        assert [ended(starter, process).problem() for process in processes] == [None] * 10
+        assert [wait_for_end(starter, process).problem() for process in processes] == [
+            None
+        ] * 10
 
 
 def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
     with closing(started(tmp_path)) as starter:
         process = waiting(starter, "m1")
         os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
-        assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+        assert wait_for_end(starter, process).problem() == "m1 was killed by SIGKILL"
     until(lambda: not is_running(int(process.pid or 0)))
 
 
-def test_processes_end_with_whoever_asked_for_them(tmp_path: Path) -> None:
+def test_processes_end_with_their_requester(tmp_path: Path) -> None:
     starter = started(tmp_path)
     processes = [waiting(starter, name) for name in ("m1", "recorder")]
     starter.close()
-    assert not any(is_running(int(one.pid or 0)) for one in processes)
+    assert not any(is_running(int(process.pid or 0)) for process in processes)
 
 
-def test_a_starter_that_fails_says_why(tmp_path: Path) -> None:
+def test_failing_starters_give_their_reason(tmp_path: Path) -> None:
     with closing(ProcessStarter(tmp_path / "absent.toml", tmp_path)) as starter:
-        process = ended(starter, starter.start("m1", WAITS))
+        process = wait_for_end(starter, starter.start("m1", WAITS))
     assert "absent.toml" in str(process.problem())
 
 
-def test_no_code_of_the_users_runs_in_the_starter(
+def test_no_user_code_runs_in_the_starter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whose threads or devices no copy would have."""
+    """Copies would not have the threads or devices of such code."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
@@ -145,5 +151,8 @@ def test_no_code_of_the_users_runs_in_the_starter(
     law = f'law = "mylaw:{name_skeleton_class("mylaw", "law")}"'
     (tmp_path / "own.toml").write_text(read_shipped("paper").replace('law = "adaptive"', law))
     with closing(ProcessStarter(tmp_path / "own.toml", tmp_path)) as starter:
-        assert ended(starter, starter.start("show", ["scenario", "show", "paper"])).code == 0
+        assert (
+            wait_for_end(starter, starter.start("show", ["scenario", "show", "paper"])).code
+            == 0
+        )
     assert not (tmp_path / "imported").exists()

@@ -1,4 +1,4 @@
-"""What the doctor finds: each trouble by itself, made here, against a machine without it."""
+"""The findings of the doctor: each trouble alone, made here, against a machine without trouble."""
 
 import json
 import os
@@ -31,14 +31,14 @@ from trilat_net.net.zenoh_bus import ZenohBus
 MEMBERS = ("m1", "s", "recorder")
 
 
-def test_a_measurement_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_measurement_gives_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     failing = "raise MemoryError('no more pages')"
     monkeypatch.setattr(doctor, "_RATES_CODE", failing)
     monkeypatch.setattr(doctor, "_RIGHTS_CODE", failing)
     monkeypatch.setattr(doctor, "is_core_cached", lambda: True)
-    for found in (doctor.examine_rate(), *doctor.examine_rights()):
-        assert found.state == "warn"
-        assert found.text.endswith("failed (exit code 1: MemoryError: no more pages)")
+    for finding in (doctor.examine_rate(), *doctor.examine_rights()):
+        assert finding.state == "warn"
+        assert finding.text.endswith("failed (exit code 1: MemoryError: no more pages)")
 
 
 def test_processes_of_their_own_measure() -> None:
@@ -53,10 +53,10 @@ def test_processes_of_their_own_measure() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("deployment") / "keys"
-    create_keys(made, MEMBERS, [], 30)
-    shutil.move(made / "authority", made.parent / "safe")
-    return made
+    keys_folder = tmp_path_factory.mktemp("deployment") / "keys"
+    create_keys(keys_folder, MEMBERS, [], 30)
+    shutil.move(keys_folder / "authority", keys_folder.parent / "safe")
+    return keys_folder
 
 
 class UnpunctualClock(ManualClock):
@@ -77,22 +77,22 @@ def states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
     return [finding.state for finding in findings]
 
 
-def test_keys_that_are_well_are_well(folder: Path) -> None:
-    (found,) = examine_keys(folder / "m1")
-    assert found.state == "ok"
-    assert "m1 of m1, s, recorder, until" in found.text
+def test_valid_keys_pass(folder: Path) -> None:
+    (finding,) = examine_keys(folder / "m1")
+    assert finding.state == "ok"
+    assert "m1 of m1, s, recorder, until" in finding.text
     assert states(examine_keys(None)) == ["ok"]
 
 
-def test_keys_that_end_soon_or_lie_open_are_told(tmp_path: Path) -> None:
+def test_keys_ending_soon_or_open_are_reported(tmp_path: Path) -> None:
     create_keys(tmp_path / "keys", MEMBERS, [], 3)
     (tmp_path / "keys" / "m1").chmod(0o755)
-    found = list(examine_keys(tmp_path / "keys" / "m1"))
-    assert [one.state for one in found] == ["warn"] * 3
+    findings = list(examine_keys(tmp_path / "keys" / "m1"))
+    assert [finding.state for finding in findings] == ["warn"] * 3
     assert [
-        "soon" in found[0].text,
-        "chmod 700" in found[1].text,
-        "authority" in found[2].text,
+        "soon" in findings[0].text,
+        "chmod 700" in findings[1].text,
+        "authority" in findings[2].text,
     ] == [True] * 3
     (tmp_path / "keys" / "m1" / "private.key").chmod(0o640)
     (refused,) = examine_keys(tmp_path / "keys" / "m1")
@@ -116,43 +116,45 @@ def member(folder: Path, place: str) -> Iterator[None]:
         bus.close()
 
 
-def test_member_with_keys_answers_one_with_keys_of_same_authority(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
-    (place, nobody) = (one.replace("tcp", "tls") for one in find_free_endpoints(2))
-    with member(folder / "m1", place):
-        assert links(folder / "s", [], [place]) == ["ok"]
-        assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]  # another authority
-        assert links(folder / "s", [place], []) == ["fail"]  # the port is taken
+    (endpoint, nobody) = (
+        free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(2)
+    )
+    with member(folder / "m1", endpoint):
+        assert links(folder / "s", [], [endpoint]) == ["ok"]
+        assert links(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]  # another authority
+        assert links(folder / "s", [endpoint], []) == ["fail"]  # the port is taken
     assert links(folder / "s", [], [nobody]) == ["fail"]
     assert links(folder / "s", [nobody], []) == ["ok"]
 
 
 @pytest.mark.long
-def test_so_it_is_over_quic(folder: Path, tmp_path: Path) -> None:
+def test_members_answer_over_quic(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
-    (place, nobody) = (one.replace("tcp", "quic") for one in find_free_endpoints(2))
-    with member(folder / "m1", place):
-        assert links(folder / "s", [], [place]) == ["ok"]
-        assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]
-        assert links(None, [], [place]) == ["warn"]
-        assert links(folder / "s", [place], []) == ["fail"]
+    (endpoint, nobody) = (
+        free_endpoint.replace("tcp", "quic") for free_endpoint in find_free_endpoints(2)
+    )
+    with member(folder / "m1", endpoint):
+        assert links(folder / "s", [], [endpoint]) == ["ok"]
+        assert links(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]
+        assert links(None, [], [endpoint]) == ["warn"]
+        assert links(folder / "s", [endpoint], []) == ["fail"]
     assert links(folder / "s", [], [nobody]) == ["fail"]
     assert links(folder / "s", [nobody], []) == ["ok"]
 
 
-def test_endpoints_that_are_open_to_a_network_are_told() -> None:
+def test_endpoints_open_to_networks_are_reported() -> None:
     assert links(None, ["tcp/0.0.0.0:0"], []) == ["fail"]
     assert links(None, ["tcp/0.0.0.0:0"], [], insecure=True) == ["warn"]
     assert links(None, ["tcp/127.0.0.1:0"], []) == ["ok"]
     assert links(None, [], ["quic/127.0.0.1:1"]) == ["warn"]  # not tried
-    with socket.create_server(("127.0.0.1", 0)) as there:
-        assert links(None, [], [f"tcp/127.0.0.1:{there.getsockname()[1]}"]) == ["ok"]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        assert links(None, [], [f"tcp/127.0.0.1:{listener.getsockname()[1]}"]) == ["ok"]
 
 
 class OddClock(ManualClock):
-    """A clock that goes on by itself, and does something odd once."""
+    """A clock that advances by itself, and does something odd once."""
 
     def __init__(self, odd_ns: int = 0, wall_step_ns: int = 0) -> None:
         super().__init__()
@@ -170,22 +172,26 @@ class OddClock(ManualClock):
 @pytest.mark.parametrize(
     ("clock", "state"), [((), "ok"), ((-5_000_000,), "fail"), ((0, 1 << 30), "warn")]
 )
-def test_a_clock_that_goes_back_or_steps_is_told(clock: tuple[int, ...], state: str) -> None:
+def test_clocks_that_go_back_are_reported(clock: tuple[int, ...], state: str) -> None:
     assert states(examine_clock(OddClock(*clock))) == [state]
 
 
 @pytest.mark.parametrize(
     ("free", "state"), [(50 << 20, "fail"), (1 << 30, "warn"), (1 << 40, "ok")]
 )
-def test_a_disk_that_is_nearly_full_is_told(
+def test_a_nearly_full_disk_is_reported(
     free: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
-    found = [one for one in examine_room(tmp_path / "not" / "there") if one.check == "disk"]
-    assert [one.state for one in found] == [state]
+    findings = [
+        finding
+        for finding in examine_room(tmp_path / "not" / "there")
+        if finding.check == "disk"
+    ]
+    assert [found_item.state for found_item in findings] == [state]
 
 
-def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     obtained = {
         "scheduling": "normal (not permitted)",
         "memory": "locked",
@@ -197,7 +203,7 @@ def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("late_ns", "every", "held"),
+    ("late_ns", "stride", "held"),
     [
         (400_000, 10, [True]),
         (
@@ -209,14 +215,12 @@ def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) 
         (2_000_000, 400, [True]),
     ],
 )
-def test_a_rate_is_held_if_ticks_begin_in_time(
-    late_ns: int, every: int, held: list[bool]
-) -> None:
+def test_rates_hold_if_ticks_begin_in_time(late_ns: int, stride: int, held: list[bool]) -> None:
     """One tick in a hundred may begin in the second half of its period, or later."""
-    found = doctor.rehearse_rates(UnpunctualClock(late_ns, every))
-    assert [doctor.is_held(*one[:2]) for one in found] == held
-    assert [rate_hz for rate_hz, _, _ in found] == list(doctor.RATES_HZ[: len(held)])
-    assert found[0][2] == late_ns // 1000
+    rates = doctor.rehearse_rates(UnpunctualClock(late_ns, stride))
+    assert [doctor.is_held(*rate[:2]) for rate in rates] == held
+    assert [rate_hz for rate_hz, _, _ in rates] == list(doctor.RATES_HZ[: len(held)])
+    assert rates[0][2] == late_ns // 1000
 
 
 @pytest.mark.parametrize(
@@ -231,37 +235,37 @@ def test_a_rate_is_held_if_ticks_begin_in_time(
         ([(100, 9000, 12000)], "fail", "holds not even 100 Hz"),
     ],
 )
-def test_the_rate_is_told_with_how_late_ticks_were(
+def test_rates_are_reported_with_their_lateness(
     rates: list[tuple[int, int, int]], state: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = SimpleNamespace(returncode=0, stdout=json.dumps(rates))
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
-    found = doctor.examine_rate()
-    assert found.state == state
-    assert text in found.text
+    finding = doctor.examine_rate()
+    assert finding.state == state
+    assert text in finding.text
 
 
 @pytest.mark.push
-def test_a_real_loop_is_measured_in_its_own_process() -> None:
+def test_real_loops_are_measured_in_own_processes() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 
 
 @pytest.mark.parametrize(
     ("kernel", "name"), [("Windows", "Windows"), ("Darwin", "macOS"), ("Linux", "")]
 )
-def test_what_is_promised_here_is_told(
+def test_promised_findings_are_reported(
     kernel: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "system", lambda: kernel)
-    found = doctor.examine_system()
-    assert found.state == ("warn" if name else "ok")
-    assert name in found.text
+    finding = doctor.examine_system()
+    assert finding.state == ("warn" if name else "ok")
+    assert name in finding.text
 
 
 def test_open_rights_are_no_finding_on_windows(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Windows lets a mode tell nothing but whether a file can be written."""
+    """On Windows a mode only says whether a file can be written."""
     (folder / "m1" / "private.key").chmod(0o666)
     try:
         monkeypatch.setattr("trilat_net.net.member_keys.sys", SimpleNamespace(platform="win32"))
@@ -271,14 +275,14 @@ def test_open_rights_are_no_finding_on_windows(
         (folder / "m1" / "private.key").chmod(0o600)
 
 
-def test_the_command_exits_with_1_if_something_fails(
+def test_the_command_exits_1_on_failures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor, "examine_rights", lambda: iter(()))
     monkeypatch.setattr(doctor, "examine_rate", lambda: doctor.DoctorFinding("rate", "ok", ""))
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     done = trilat("doctor", "--json", cwd=tmp_path)
-    assert {one["check"] for one in json.loads(done.out)} >= {
+    assert {finding["check"] for finding in json.loads(done.out)} >= {
         "keys",
         "links",
         "clock",
@@ -291,12 +295,10 @@ def test_the_command_exits_with_1_if_something_fails(
     assert "--insecure" in done.out
 
 
-def test_a_session_that_nobody_answers_for_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unanswering_session_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "CONNECT_S", 0.2)
     connection = Connection((), find_free_endpoints(1))
-    found = list(
+    findings = list(
         examine_machine(connection, None, tmp_path, "x", SystemClock(), insecure=False)
     )
-    assert ("clock", "fail") in {(one.check, one.state) for one in found}
+    assert ("clock", "fail") in {(finding.check, finding.state) for finding in findings}

@@ -1,4 +1,4 @@
-"""An arm outside of the program: its measurements are the record, and without them nothing goes on."""
+"""An external arm: its measurements are the record, and without them the session stops."""
 
 import math
 import re
@@ -57,7 +57,7 @@ A_SECOND = 1_000_000_000
 
 
 class Pendulum:
-    """Joints that do not feel each other, with friction: no arm of ours."""
+    """Uncoupled joints with friction, as an external arm."""
 
     def __init__(self, q: Sequence[float]) -> None:
         self.q, self.qd = list(q), [0.0] * len(q)
@@ -80,7 +80,9 @@ def driving(
     senses: bool = False,
     poses: list[tuple[int, list[float]]] | None = None,
 ) -> Act:
-    """The program of an arm; with `poses`, which it notes with their times, one that has brakes."""
+    """The program of an arm; `poses` collects its times and poses, and a program with `poses`
+    has brakes.
+    """
     body = arm or Pendulum((0.3, -0.1))
 
     def drive(bus: Bus, clock: RelayClock) -> None:
@@ -114,7 +116,7 @@ def session_of(
     return session, session.ends
 
 
-def test_an_external_arms_measurement_is_the_record_and_drives_it(tmp_path: Path) -> None:
+def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     sent: list[list[float]] = []
     torques: list[tuple[float, ...]] = []
     session, ends = session_of(tmp_path, driving(sent, torques))
@@ -122,7 +124,9 @@ def test_an_external_arms_measurement_is_the_record_and_drives_it(tmp_path: Path
     assert ends == {"m": 0, "s": 0}
     records = [[*state.q, *state.qd] for state in log["s"].states]
     # every measurement, in order, to the bit
-    assert records in [sent[n : n + 1000] for n, one in enumerate(sent) if one == records[0]]
+    assert records in [
+        sent[n : n + 1000] for n, record_sent in enumerate(sent) if record_sent == records[0]
+    ]
     taus = [tuple(state.tau) for state in log["s"].states]
     assert [tau for tau in torques if tau in taus] == torques
     assert set(taus[:-1]) <= set(torques)
@@ -135,7 +139,7 @@ def test_an_external_arms_measurement_is_the_record_and_drives_it(tmp_path: Path
 
 
 def whole(log: Log) -> None:
-    """Executed again, and virtual time fed with it, bit for bit."""
+    """Asserts that the log is executed again, and equals virtual time fed with the log, bit for bit."""
     assert log.complete
     verdict = verify(log)
     assert verdict.whole_run
@@ -144,8 +148,10 @@ def whole(log: Log) -> None:
 
 
 @pytest.mark.long
-def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None:
-    """Its tau_x is the record's to the bit, goes to the peers, and is what the log executes again."""
+def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
+    """The measured tau_x is the record's to the bit, goes to the peers, and enters the repeated
+    execution.
+    """
     changes = {**ARM, "duration_s": 0.3}
     Site(six(**changes).setup("s")).step(TickInput(0))  # compiles, before anybody waits
     sent: list[list[float]] = []
@@ -157,12 +163,14 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
     log = session.run()
     assert set(session.ends.values()) == {0}
     records = [[*state.q, *state.qd, *state.tau_x] for state in log["s"].states]
-    assert records in [sent[n : n + 300] for n, one in enumerate(sent) if one == records[0]]
+    assert records in [
+        sent[n : n + 300] for n, record_sent in enumerate(sent) if record_sent == records[0]
+    ]
     assert abs(log["s"].tau_x).min(axis=0).max() > 0.0
     whole(log)
 
 
-def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None:
+def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
     scenario = six(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
     session.stranger(
@@ -184,7 +192,7 @@ def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None
     )
 
 
-def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
+def test_silent_arms_are_held_then_in_fault(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_300_000_000))
     log = session.run()
     assert ends == {"m": 0, "s": 0}
@@ -204,9 +212,7 @@ def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "frozen_s", [0.3, *(pytest.param(s, marks=pytest.mark.long) for s in (1.0, 3.0, 10.0))]
 )
-def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(
-    frozen_s: float, tmp_path: Path
-) -> None:
+def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     poses: list[tuple[int, list[float]]] = []
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
@@ -237,12 +243,12 @@ def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(
     whole(log)
 
 
-def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
+def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
     """Held from 0.2 s to 0.5 s, then silent; again from 0.8 s, and let go at 1.1 s."""
     session, ends = session_of(
         tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
     )
-    told: list[tuple[bool, str]] = []
+    answers: list[tuple[bool, str]] = []
 
     def hold(bus: Bus, clock: RelayClock) -> None:
         with SwitchClient(bus, clock, SESSION, "s") as switch:
@@ -256,7 +262,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
                     clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             switch.send(held=False)
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
-            told.extend(
+            answers.extend(
                 (one.accepted, one.text)
                 for one in reached(bus, clock).send_order(["s"], "enable")
             )
@@ -275,7 +281,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
         for event in log.events
     ]
     assert len([text for text in said if text]) == 3
-    assert told == [
+    assert answers == [
         (
             False,
             "the dead-man switch of s is not held; enable the site while the switch is held",
@@ -285,7 +291,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
     whole(log)
 
 
-def test_a_switch_is_for_an_arm_outside_alone() -> None:
+def test_switches_need_external_arms() -> None:
     with pytest.raises(
         ScenarioError, match=r"sites\.s\.arm\.dead_man: applies only to an external arm"
     ):
@@ -293,7 +299,7 @@ def test_a_switch_is_for_an_arm_outside_alone() -> None:
 
 
 class Switch:
-    """A switch, and programs that say whether they hold it."""
+    """A switch, and programs that report whether they hold the switch."""
 
     def __init__(self) -> None:
         self.clock, self.dropped = ManualClock(), Counter[str]()
@@ -303,16 +309,16 @@ class Switch:
     def hear(
         self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0
     ) -> bool:
-        """Hears of one program; returns whether it is held then."""
+        """Processes a message of one program; returns whether the switch is held then."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.ring.receive(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
         self.switch.poll()
         return self.switch.held
 
 
-def test_a_switch_is_held_until_let_go_or_silent() -> None:
-    one = Switch()
-    switch, clock, ring, hear = one.switch, one.clock, one.ring, one.hear
+def test_switches_hold_until_released_or_silent() -> None:
+    dead_man = Switch()
+    switch, clock, ring, hear = dead_man.switch, dead_man.clock, dead_man.ring, dead_man.hear
     assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
     assert switch.pop_order(Mode.FAULT, LifeReason.START) == ""
     assert not hear(1, 0, site="m")
@@ -329,53 +335,55 @@ def test_a_switch_is_held_until_let_go_or_silent() -> None:
     assert hear(2, 1)
     ring.receive(b"garbage")
     switch.poll()
-    assert one.dropped == {"stranger": 1, "old switch message": 1, "malformed": 1}
+    assert dead_man.dropped == {"stranger": 1, "old switch message": 1, "malformed": 1}
 
 
 @pytest.mark.parametrize("first", [1, 2])
-def test_of_two_that_hold_switch_whoever_lets_go_stops_arm(first: int) -> None:
+def test_of_two_holders_either_release_stops(first: int) -> None:
     """The other one has to let go and press anew: a hand-over goes by way of a stop."""
-    one, other = Switch(), 3 - first
-    assert one.hear(1, 0)
-    assert one.hear(2, 0)
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
-    assert not one.hear(first, 1, held=False)
-    assert not one.hear(other, 1)  # it still holds
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert not one.hear(other, 2)
-    assert not one.hear(other, 3, held=False)
-    assert one.hear(other, 4)
-    assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    switch, other = Switch(), 3 - first
+    assert switch.hear(1, 0)
+    assert switch.hear(2, 0)
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
+    assert not switch.hear(first, 1, held=False)
+    assert not switch.hear(other, 1)  # it still holds
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert not switch.hear(other, 2)
+    assert not switch.hear(other, 3, held=False)
+    assert switch.hear(other, 4)
+    assert switch.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
-def test_of_two_that_hold_switch_silence_of_one_stops_arm() -> None:
-    """As its program crashed; nor does one go on that lets go and presses within a tick."""
-    one = Switch()
-    assert one.hear(1, 0)
+def test_of_two_holders_either_silence_stops() -> None:
+    """Silence means that its program crashed; a release and press within a tick does not
+    continue the hold either.
+    """
+    switch = Switch()
+    assert switch.hear(1, 0)
     for n in range(4):
-        assert one.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
-    assert not one.hear(2, 4, after_ns=1)
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert not one.hear(2, 5)
-    assert not one.hear(2, 6, held=False)
-    assert one.hear(2, 7)
-    assert not one.hear(2, 8, held=False)
-    assert one.hear(2, 9)
-    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+        assert switch.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
+    assert not switch.hear(2, 4, after_ns=1)
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert not switch.hear(2, 5)
+    assert not switch.hear(2, 6, held=False)
+    assert switch.hear(2, 7)
+    assert not switch.hear(2, 8, held=False)
+    assert switch.hear(2, 9)
+    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert switch.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
-def test_many_idle_switch_programs_forget_nobody_who_holds() -> None:
-    one = Switch()
-    assert one.hear(0, 0)
+def test_idle_switch_programs_displace_no_holder() -> None:
+    switch = Switch()
+    assert switch.hear(0, 0)
     for boot in range(1, 2 * STARTS_KEPT):
-        assert one.hear(boot, 0, held=False)
-    assert not one.hear(0, 0, after_ns=SWITCH_SILENCE_NS + 1)  # said before
-    assert one.dropped == {"old switch message": 1}
+        assert switch.hear(boot, 0, held=False)
+    assert not switch.hear(0, 0, after_ns=SWITCH_SILENCE_NS + 1)  # said before
+    assert switch.dropped == {"old switch message": 1}
 
 
 @pytest.mark.long
-def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
+def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     """Both programs are started again by hand; meanwhile brakes hold the arm, and its peer holds."""
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0}
     scenario = load_scenario(
@@ -406,7 +414,7 @@ def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     assert result.absences == [("s", *gone)]
 
 
-def test_without_an_arm_nothing_begins_and_that_is_said(tmp_path: Path) -> None:
+def test_without_an_arm_nothing_begins(tmp_path: Path) -> None:
     session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 
     def alone(clock: RelayClock) -> None:
@@ -419,7 +427,7 @@ def test_without_an_arm_nothing_begins_and_that_is_said(tmp_path: Path) -> None:
     session.play()
 
 
-def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: Path) -> None:
+def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], []))
 
     def shout(bus: Bus, clock: RelayClock) -> None:
@@ -485,7 +493,7 @@ class Heard:
         (measurement(site="m"), "stranger"),
     ],
 )
-def test_what_is_no_measurement_is_counted_and_dropped(payload: bytes, reason: str) -> None:
+def test_invalid_measurements_are_counted_and_dropped(payload: bytes, reason: str) -> None:
     heard = Heard()
     heard.hear(payload)
     assert heard.arm.newest is None
@@ -493,7 +501,7 @@ def test_what_is_no_measurement_is_counted_and_dropped(payload: bytes, reason: s
 
 
 @given(order=st.permutations(range(8)), bound=st.booleans())
-def test_the_newest_counts_in_whatever_order_they_come(order: list[int], bound: bool) -> None:
+def test_the_newest_measurement_counts_in_any_order(order: list[int], bound: bool) -> None:
     heard = Heard()
     heard.hear(measurement(n=0, q=[-0.001, 0.0]))
     if bound:
@@ -516,7 +524,7 @@ def test_a_flood_of_measurements_is_bounded_and_counted() -> None:
     assert heard.dropped["missing measurement"] == 8
 
 
-def test_program_that_is_started_anew_counts_until_session_begins() -> None:
+def test_restarted_programs_count_until_the_session_begins() -> None:
     heard = Heard()
     heard.hear(measurement(boot=1, n=900), measurement(boot=2, n=0, q=[2.0, 2.0]))
     assert heard.arm.newest.q == [2.0, 2.0]
@@ -526,7 +534,7 @@ def test_program_that_is_started_anew_counts_until_session_begins() -> None:
     assert heard.dropped == {"stranger": 1}
 
 
-def test_silence_is_what_the_site_itself_could_have_heard() -> None:
+def test_silence_counts_only_hearing_time() -> None:
     """A process that slept for a minute has heard nothing, and knows nothing of the arm."""
     heard = Heard()
     heard.hear(measurement())
@@ -548,7 +556,7 @@ def test_silence_is_what_the_site_itself_could_have_heard() -> None:
     assert heard.arm.newest.q == [0.5, 0.25]
 
 
-def test_a_short_silence_is_over_with_the_next_measurement() -> None:
+def test_short_silences_end_with_a_measurement() -> None:
     heard = Heard()
     heard.hear(measurement())
     heard.arm.bind((0.5, 0.25))
@@ -563,7 +571,7 @@ def test_a_short_silence_is_over_with_the_next_measurement() -> None:
     assert heard.arm.pop_order(Mode.RETURN) == ""
 
 
-def test_an_encoder_glitch_is_no_measurement_repeated_it_is_silence() -> None:
+def test_encoder_glitches_count_as_silence() -> None:
     """The arm of two_sites may move at 100 rad/s, 0.1 rad in a period."""
     heard = Heard()
     heard.hear(measurement(n=0))
@@ -580,7 +588,7 @@ def test_an_encoder_glitch_is_no_measurement_repeated_it_is_silence() -> None:
     assert heard.dropped["implausible measurement"] == 75
 
 
-def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
+def test_torque_counts_while_fresh_and_running() -> None:
     network, clock = LocalNetwork(), ManualClock()
     site = network.join()
     port = ArmClient(network.join(), clock, "t", "s")
@@ -637,7 +645,7 @@ def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     assert port.over
 
 
-def test_a_site_that_is_gone_is_over() -> None:
+def test_a_missing_site_is_over() -> None:
     network = LocalNetwork()
     port = ArmClient(network.join(), ManualClock(), "t", "s")
     site = network.join()

@@ -1,4 +1,4 @@
-"""Hands of a live session: as their users have them, as the site takes them in, and what hostile ones get."""
+"""Hands of a live session: used by programs, received by a site, and attacked."""
 
 import math
 from collections import Counter
@@ -75,13 +75,13 @@ def test_a_session_with_people_is_verified_and_repeated(
     session: tuple[Log, Felt],
 ) -> None:
     log, _ = session
-    found = verify(log)
-    assert found.passed
-    assert found.identical == found.records == 3 * 1500
-    assert compare_with_virtual(log).fed.identical == found.records
+    verification = verify(log)
+    assert verification.passed
+    assert verification.identical == verification.records == 3 * 1500
+    assert compare_with_virtual(log).fed.identical == verification.records
 
 
-def test_its_events_say_who_held_and_counts_who_was_refused(session: tuple[Log, Felt]) -> None:
+def test_events_name_holders_and_count_refusals(session: tuple[Log, Felt]) -> None:
     log, _ = session
     said = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
     assert sorted(said) == sorted(
@@ -91,7 +91,7 @@ def test_its_events_say_who_held_and_counts_who_was_refused(session: tuple[Log, 
     assert not any("hand" in reason for reason in log.link_stats("m2")[-1].dropped)
 
 
-def test_what_a_hand_feels_is_what_acts_on_the_arm(session: tuple[Log, Felt]) -> None:
+def test_felt_torque_equals_the_arms_torque(session: tuple[Log, Felt]) -> None:
     log, felt = session
     part = log["m1"]
     (l1, l2), seen = SCENARIO.arms["m1"].lengths_m, 0
@@ -105,7 +105,7 @@ def test_what_a_hand_feels_is_what_acts_on_the_arm(session: tuple[Log, Felt]) ->
     assert seen > 30
 
 
-def test_a_hand_does_what_its_mode_says() -> None:
+def test_hands_follow_their_mode() -> None:
     bus, clock = LocalNetwork().join(), ManualClock()
     with open_hand(bus, clock, "t", "m1", SCENARIO) as hand:
         with pytest.raises(UsageError, match="can move, not push"):
@@ -164,8 +164,8 @@ def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -
     assert served.dropped == {reason: 1}
 
 
-def test_flood_is_read_little_at_time_and_moves_nobody() -> None:
-    """A hundred messages a tick of others: the holder's arm stays as it was, and few are looked at."""
+def test_floods_are_read_slowly_and_move_nobody() -> None:
+    """A hundred messages a tick of others: the holder's arm stays still, and few messages are read."""
     served = Served()
     served.take(message())
     for k in range(1, 100):

@@ -1,4 +1,4 @@
-"""A law from outside in a live session: the same bits; and where it fails, an end in order for all."""
+"""A law from outside in a live session: the same bits; a failing law ends the session in order."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, 
     return session.run(), session.ends or {}
 
 
-def test_a_copy_of_the_papers_law_has_its_bits_live(tmp_path: Path) -> None:
+def test_own_paper_law_has_live_bits(tmp_path: Path) -> None:
     law = {"law": "tests.laws:Adaptive"}
     log, ends = lived(tmp_path, "two_sites", control=law)
     assert ends == {"m": 0, "s": 0}
@@ -31,7 +31,7 @@ def test_a_copy_of_the_papers_law_has_its_bits_live(tmp_path: Path) -> None:
     assert verdict.identical == verdict.records == 1000
 
 
-def test_what_laws_send_each_other_is_that_of_virtual_time(tmp_path: Path) -> None:
+def test_law_messages_equal_those_of_virtual_time(tmp_path: Path) -> None:
     log, _ = lived(
         tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3
     )
@@ -41,7 +41,7 @@ def test_what_laws_send_each_other_is_that_of_virtual_time(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("how", ["nan", "raises"])
-def test_a_law_that_fails_ends_the_session_in_order(how: str, tmp_path: Path) -> None:
+def test_failing_laws_end_the_session_in_order(how: str, tmp_path: Path) -> None:
     control = {"law": "tests.laws:Failing", "how": how, "at": 250}
     log, ends = lived(tmp_path, "paper", **{"sites.m2.control": control})
     assert isinstance(ends["m2"], LawFailed)
@@ -51,17 +51,17 @@ def test_a_law_that_fails_ends_the_session_in_order(how: str, tmp_path: Path) ->
         assert str(ends[other]) == f"{other} ended because {text}"
     assert log.complete
     assert [event.text for event in log.events if event.kind == "failed"] == [text]
-    made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    assert made["m2"] == len(log["m2"]) == 250
+    ticks_made = {event.member: event.ticks for event in log.events if event.kind == "end"}
+    assert ticks_made["m2"] == len(log["m2"]) == 250
     for other in ("m1", "s"):
-        assert 250 < made[other] == len(log[other]) < 500
+        assert 250 < ticks_made[other] == len(log[other]) < 500
     assert verify(log).passed
     twins = compare_with_virtual(log)
     assert twins.fed.first is None
-    assert twins.fed.identical == sum(made.values())
+    assert twins.fed.identical == sum(ticks_made.values())
 
 
-def test_law_that_fails_at_rest_is_told_before_session() -> None:
+def test_laws_failing_at_rest_are_found_beforehand() -> None:
     control = {"law": "tests.laws:Failing", "how": "nan", "at": 3}
     scenario = load_scenario("two_sites", {"sites.s.control": control})
     with pytest.raises(LawFailed, match=r"of s failed at tick 3: .* this was the rehearsal"):

@@ -1,4 +1,6 @@
-"""Sites that leave a running session, come back or come late: the others go on, and the log explains it."""
+"""Sites that leave a running session, return or come late: the other sites continue, and the
+log explains it.
+"""
 
 from pathlib import Path
 
@@ -27,7 +29,7 @@ def engaged_after_s(log: Log, site: str, tick: int) -> float:
     return float(part.tick[np.argmax(after)] - tick) / part.rate_hz
 
 
-def test_site_that_is_killed_comes_back_and_log_is_whole(tmp_path: Path) -> None:
+def test_killed_sites_return_and_logs_are_whole(tmp_path: Path) -> None:
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 4 * S
     session.site("m", at_ns=5 * S)
@@ -56,7 +58,7 @@ def kinds_about(log: Log, member: str, about: str) -> list[str]:
     ]
 
 
-def test_whose_end_it_was_is_told_to_the_others(tmp_path: Path) -> None:
+def test_ended_sites_are_named_to_the_others(tmp_path: Path) -> None:
     session = Session.whole(gliding(4.0), tmp_path, ends={})
     session.interrupt("s", 3 * S)
     log = session.run()
@@ -77,7 +79,7 @@ def test_whose_end_it_was_is_told_to_the_others(tmp_path: Path) -> None:
     assert log.expected_ticks("s") == end.ticks
 
 
-def test_a_site_waits_for_a_departed_one_only_as_told(tmp_path: Path) -> None:
+def test_departed_sites_are_awaited_only_as_configured(tmp_path: Path) -> None:
     session = Session.whole(
         gliding(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}}
     )
@@ -110,7 +112,7 @@ def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
     assert check.passed, check.findings
 
 
-def test_site_may_come_late_where_first_one_begins_without_it(tmp_path: Path) -> None:
+def test_late_sites_may_join_a_flexible_start(tmp_path: Path) -> None:
     scenario = gliding(5.0, "asymmetric")
     session = Session(
         scenario,
@@ -133,7 +135,7 @@ def test_site_may_come_late_where_first_one_begins_without_it(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("dies", ["m1", pytest.param("s", marks=pytest.mark.long)])
-def test_sites_on_clocks_of_their_own_find_the_grid_again(dies: str, tmp_path: Path) -> None:
+def test_sites_on_other_clocks_find_the_grid(dies: str, tmp_path: Path) -> None:
     """The first site, whose grid the others follow, as well as another."""
     skews = {"m1": (7 * S, 60_000), "s": (-500_000_000, -100_000)}
     session = Session.whole(gliding(8.0, "asymmetric"), tmp_path, ends={}, skews=skews)
@@ -154,8 +156,11 @@ def test_sites_on_clocks_of_their_own_find_the_grid_again(dies: str, tmp_path: P
     assert "clock fault" not in {event.kind for event in log.events}
 
 
-def test_another_start_waits_while_the_one_before_is_there(tmp_path: Path) -> None:
-    """It answers: that is said at once. Frozen, it does not: its token still keeps its place."""
+def test_second_starts_wait_for_present_ones(tmp_path: Path) -> None:
+    """A present site that answers is reported at once.
+
+    A frozen one does not answer, but its token keeps its place.
+    """
     session = Session.whole(gliding(4.0), tmp_path, ends={})
     refused: list[object] = []
 
@@ -173,7 +178,7 @@ def test_another_start_waits_while_the_one_before_is_there(tmp_path: Path) -> No
     assert len(log["m"]) == 800
 
 
-def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path) -> None:
+def test_late_recorders_learn_of_ticks_not_made(tmp_path: Path) -> None:
     session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
     for name in ("m", "s"):
         session.site(name, needs_recorder=False)
@@ -182,10 +187,10 @@ def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path
     session.recorder(at_ns=7 * S)
     log = session.run()
     ((first, _),) = log.starts["m"]
-    ((away, last),) = log.absences["m"]
-    assert (away, last) == (log["s"].used["m"][log["s"].tick < first].max() + 1, first - 1)
+    ((absence, last),) = log.absences["m"]
+    assert (absence, last) == (log["s"].used["m"][log["s"].tick < first].max() + 1, first - 1)
     # the memory of the first start went with it; the other site heard all
-    assert log.missing("m") == away
+    assert log.missing("m") == absence
     assert len(log["s"]) == 1600
     assert log.missing("s") == 0
     assert "agree with the messages" in [
@@ -193,8 +198,11 @@ def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path
     ]
 
 
-def test_a_sample_whose_record_died_leaves_few_ticks_open(tmp_path: Path) -> None:
-    """Its peer used it until it held: those ticks cannot be executed. What it held is in its records."""
+def test_samples_without_record_leave_few_ticks_open(tmp_path: Path) -> None:
+    """Its peer used such a sample until it held: those ticks cannot be executed.
+
+    The held sample is in the peer's records.
+    """
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/state", 4 * S - 14_000_000, 5 * S)
     session.clocks["m"].dies_ns = 4 * S
@@ -207,7 +215,7 @@ def test_a_sample_whose_record_died_leaves_few_ticks_open(tmp_path: Path) -> Non
     assert 0 < result.unjudged <= 3 + 4
 
 
-def test_a_one_way_cut_is_in_the_last_words(tmp_path: Path) -> None:
+def test_one_way_cuts_are_in_last_messages(tmp_path: Path) -> None:
     session = Session.whole(gliding(3.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/sample", 3 * S, 60 * S)
     log = session.run()
@@ -218,8 +226,8 @@ def test_a_one_way_cut_is_in_the_last_words(tmp_path: Path) -> None:
     }
 
 
-def test_a_site_that_some_do_not_admit_names_them(tmp_path: Path) -> None:
-    """What it says does not reach one of them: it waits, and says why it does not join."""
+def test_a_site_not_admitted_names_the_refusers(tmp_path: Path) -> None:
+    """Its messages do not reach one of them: the site waits, and reports why it does not join."""
     session = Session.whole(gliding(9.0, "asymmetric"), tmp_path, ends={})
     session.clocks["s"].dies_ns = 3 * S
     failed: list[str] = []
@@ -237,31 +245,31 @@ def test_a_site_that_some_do_not_admit_names_them(tmp_path: Path) -> None:
     assert "m2 did not admit s to the running session" in failed[0]
 
 
-def test_a_site_says_that_a_peer_does_not_hear_it(tmp_path: Path) -> None:
+def test_sites_report_peers_that_cannot_hear_them(tmp_path: Path) -> None:
     session = Session.whole(gliding(4.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/sample", 3 * S, 3 * S + 600_000_000)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    told = [
+    texts = [
         (event.kind, event.about, event.t_ns) for event in log.events if "hear" in event.kind
     ]
-    assert [kind for kind, _, _ in told] == ["unheard", "heard"]
-    assert {about for _, about, _ in told} == {"s"}
+    assert [kind for kind, _, _ in texts] == ["unheard", "heard"]
+    assert {about for _, about, _ in texts} == {"s"}
     cut_s = 3.0 - log.events[0].epoch_mono_ns / S if log.events[0].epoch_mono_ns else 0.0
-    assert 0.2 <= told[0][2] / S - cut_s <= 0.4
+    assert 0.2 <= texts[0][2] / S - cut_s <= 0.4
     assert "hold" in log["s"].mode
     assert "hold" not in log["m"].mode
     assert verify(log).passed
 
 
 @pytest.mark.long
-def test_certificate_says_what_theorem_covers_and_judges_rest(tmp_path: Path) -> None:
+def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     session = Session.whole(gliding(7.0, "paper"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4 * S
     session.site("m1", at_ns=5 * S)
     log = session.run()
-    found = certify(log)
-    premises = {premise.name: premise for premise in found.premises}
+    certificate = certify(log)
+    premises = {premise.name: premise for premise in certificate.premises}
     assert premises["presence"].holds is False
     (first, last), rate_hz = log.absences["m1"][0], 200
     assert (
@@ -270,19 +278,23 @@ def test_certificate_says_what_theorem_covers_and_judges_rest(tmp_path: Path) ->
     assert premises["presence"].text.count("all follow from") == 2
     assert premises["presence"].text.count("delays are constant") == 2
     assert premises["records"].holds
-    assert found.evidence.functional_share == 1.0
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    link = next(one for one in summarise_links(log) if (one.peer, one.site) == ("m1", "s"))
+    assert certificate.evidence.functional_share == 1.0
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    link = next(
+        link_of_log
+        for link_of_log in summarise_links(log)
+        if (link_of_log.peer, link_of_log.site) == ("m1", "s")
+    )
     assert link.loss == 0.0
 
 
 @pytest.mark.parametrize(
     ("dies_ms", "again_ms"), [pytest.param(4300, 5000, marks=pytest.mark.long), (4050, 4060)]
 )
-def test_a_start_dead_before_tick_0_leaves_its_place(
+def test_starts_dead_before_tick_0_free_places(
     dies_ms: int, again_ms: int, tmp_path: Path
 ) -> None:
-    """Also if the other site admits it only when the next one is there already."""
+    """Also if the other site admits the dead start only when the next one is there already."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 3 * S
     session.site("m", at_ns=4 * S)
@@ -297,7 +309,7 @@ def test_a_start_dead_before_tick_0_leaves_its_place(
     assert check_file(session.path).passed
 
 
-def test_a_returning_site_does_not_wait_for_a_leaving_one(tmp_path: Path) -> None:
+def test_returning_sites_ignore_leaving_ones(tmp_path: Path) -> None:
     session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 3 * S
     session.site("m1", at_ns=4 * S)
@@ -316,7 +328,9 @@ def test_a_returning_site_does_not_wait_for_a_leaving_one(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("later_ms", [60, pytest.param(140, marks=pytest.mark.long)])
 def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: Path) -> None:
-    """Who comes second learns of the first start from those that admit both, who know it only since."""
+    """The second site learns of the first start from those that admit both, which know of that
+    start only since then.
+    """
     session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
     for name, wait_ms in (("m2", 0), ("m1", later_ms)):
         session.interrupt(name, 3 * S + wait_ms * 1_000_000, 15)
@@ -328,8 +342,10 @@ def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: 
     assert verify(log).passed
 
 
-def test_a_frozen_start_ends_when_another_has_its_place(tmp_path: Path) -> None:
-    """Its token went, as that of a process that is stopped for longer than its lease does."""
+def test_frozen_starts_end_after_their_replacement(tmp_path: Path) -> None:
+    """The token of the frozen start went, like that of a process that is stopped for longer
+    than its lease.
+    """
     session = Session.whole(gliding(8.0), tmp_path, ends={})
     session.clocks["m"].stall(3 * S, 3 * S)
     session.clocks["s"].at(3 * S + 500_000_000, lambda: session.lose_token("m"))
@@ -345,7 +361,7 @@ def test_a_frozen_start_ends_when_another_has_its_place(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
-    """The first one is gone before a site comes back, the second begins while it is away."""
+    """The first recorder is gone before a site returns, the second begins while the site is away."""
     stops_ns = 3 * S + 500_000_000
     session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
     session.recorder(lambda: session.relay.now_ns >= stops_ns)
@@ -368,7 +384,7 @@ def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
     assert check_file(*parts).passed
 
 
-def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None:
+def test_lost_tokens_alone_are_no_departure(tmp_path: Path) -> None:
     """As a reconnection may report the end of a connection after its return."""
     session = Session.whole(
         gliding(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}}
@@ -379,8 +395,10 @@ def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None
     assert session.ends == {"m": 0, "s": 0}
 
 
-def test_site_at_its_end_waits_for_recorder_whose_connection_broke(tmp_path: Path) -> None:
-    """Its token is gone, and it heard neither the last records nor the end; then it asks for them."""
+def test_ending_sites_await_disconnected_recorders(tmp_path: Path) -> None:
+    """The recorder's token is gone, and it received neither the last records nor the end; then
+    it asks for them.
+    """
     session = Session.whole(gliding(2.0), tmp_path, ends={})
     session.clocks["s"].at(3 * S + 600_000_000, lambda: session.lose_token("recorder"))
     for name in ("m", "s"):

@@ -28,7 +28,7 @@ EPOCH_NS = 5_000_000_123
 
 
 class LateClock(ManualClock):
-    """Wakes late where it is told to; remembers the deadlines it was asked for."""
+    """A clock that wakes late at chosen times, and remembers the requested deadlines."""
 
     def __init__(self, oversleep: dict[int, int] | None = None) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class LateClock(ManualClock):
 
 
 class Alone:
-    """One site's loop without peers who speak."""
+    """One site's loop with silent peers."""
 
     def __init__(self, clock: ManualClock, overrides: dict[str, object] | None = None) -> None:
         scenario = load_scenario("two_sites", {"duration_s": 2.0, **(overrides or {})})
@@ -86,7 +86,7 @@ class Alone:
 
 
 @pytest.mark.parametrize("rate_hz", [100, 333, 1000, 1024, 3000])
-def test_ticks_lie_on_an_absolute_grid_at_any_rate(rate_hz: int) -> None:
+def test_ticks_lie_on_an_absolute_grid(rate_hz: int) -> None:
     clock = LateClock()
     Alone(clock, {"rate_hz": rate_hz}).run()
     assert clock.deadlines == [
@@ -94,7 +94,7 @@ def test_ticks_lie_on_an_absolute_grid_at_any_rate(rate_hz: int) -> None:
     ]
 
 
-def test_missed_ticks_run_back_to_back_and_are_counted() -> None:
+def test_missed_ticks_run_back_to_back() -> None:
     alone = Alone(LateClock({5: 7_300_000}))
     alone.run()
     late = [state.late_us for state in alone.states]
@@ -116,7 +116,7 @@ def test_lateness_enters_no_formula() -> None:
     assert max(state.late_us for state in late.states) == 400_000
 
 
-def test_a_turn_shifts_wake_ups_and_nothing_else() -> None:
+def test_turns_shift_only_wake_ups() -> None:
     clock, prompt = LateClock(), Alone(LateClock())
     in_turn = Alone(clock)
     prompt.run()
@@ -127,14 +127,14 @@ def test_a_turn_shifts_wake_ups_and_nothing_else() -> None:
     ] == prompt.states
 
 
-def test_statistics_and_slack_come_ten_times_second_after_tick() -> None:
+def test_statistics_and_slack_come_at_10_hz() -> None:
     alone = Alone(LateClock())
     alone.run()
     assert [link.tick for link in alone.links] == list(range(0, 2000, 100))
     assert alone.slack == [(link.tick, link.t_ns) for link in alone.links]
 
 
-def test_a_loop_that_is_stopped_makes_no_further_tick() -> None:
+def test_stopped_loops_make_no_further_tick() -> None:
     alone = Alone(LateClock())
     alone.stopped = lambda: len(alone.states) >= 30
     output = alone.run()
@@ -146,7 +146,7 @@ def test_a_loop_that_is_stopped_makes_no_further_tick() -> None:
     assert none.states == []
 
 
-def test_a_run_beyond_its_limits_ends_with_a_diverged_record() -> None:
+def test_diverged_records_end_runs_beyond_limits() -> None:
     alone = Alone(LateClock(), {"limits.qd_limit_rad_s": 0.05, "sites.m.q0_rad": [0.4, -0.2]})
     output = alone.run()
     assert output.mode is Mode.DIVERGED
@@ -166,9 +166,7 @@ SCENARIOS = {
 
 @pytest.mark.parametrize("name", SCENARIOS)
 @pytest.mark.push
-def test_session_of_live_loops_equals_virtual_time_bit_for_bit(
-    name: str, tmp_path: Path
-) -> None:
+def test_live_loops_equal_virtual_time_bitwise(name: str, tmp_path: Path) -> None:
     scenario = load_scenario(name, SCENARIOS[name])
     log = Session.whole(scenario, tmp_path).run()
     assert log.complete
@@ -188,7 +186,7 @@ def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
     assert in_log(log) == in_virtual_time(scenario)
 
 
-def test_stall_beyond_delay_changes_nothing_before_first_late_sample(tmp_path: Path) -> None:
+def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
     session.clocks["m2"].stall(2_000_000_000, 300_000_000)
@@ -207,7 +205,7 @@ def test_stall_beyond_delay_changes_nothing_before_first_late_sample(tmp_path: P
 
 
 def shout(bus: Bus, clock: RelayClock) -> None:
-    """Publishes what is no message on every key of a session, for as long as it may run."""
+    """Publishes invalid messages on every key of a session, while the session runs."""
     targets = [
         bus.publisher(topics.key(SESSION, member, channel))
         for member in ("m1", "m2", "s", "recorder", "nobody")
@@ -220,13 +218,13 @@ def shout(bus: Bus, clock: RelayClock) -> None:
 
 
 def come_and_go(bus: Bus, clock: RelayClock) -> None:
-    """A token that is no number of a start."""
+    """Publishes a token that is no number of a start."""
     bus.announce(f"trilat/{SESSION}/m1/alive/no-number")
     clock.sleep_until(clock.monotonic_ns() + 300_000_000)
     bus.close()
 
 
-def test_strangers_and_their_garbage_change_no_bit_and_are_counted(tmp_path: Path) -> None:
+def test_strangers_and_their_garbage_change_no_bit(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
     session.stranger(shout)
@@ -240,7 +238,7 @@ def test_strangers_and_their_garbage_change_no_bit_and_are_counted(tmp_path: Pat
     assert int(log.accounts["dropped: oversized"]) > 0
 
 
-def test_a_site_asked_to_end_ends_in_order(tmp_path: Path) -> None:
+def test_a_site_ends_in_order_on_request(tmp_path: Path) -> None:
     scenario = load_scenario("two_sites", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
 
@@ -258,7 +256,7 @@ def test_a_site_asked_to_end_ends_in_order(tmp_path: Path) -> None:
     assert verify(log).passed
 
 
-def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
+def test_latecomers_learn_the_sessions_progress(tmp_path: Path) -> None:
     session = Session.whole(load_scenario("two_sites", {"duration_s": 1.0}), tmp_path)
     refused: list[str] = []
 
@@ -273,21 +271,21 @@ def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
     session.stranger(come_late, at_ns=2_000_000_000)
     assert session.run().complete
     assert len(refused) == 1
-    told = re.search(r"session 't' is running; (m|s) is at tick (\d+)", refused[0])
-    assert told, refused
-    assert 200 < int(told[2]) < 1000
+    match = re.search(r"session 't' is running; (m|s) is at tick (\d+)", refused[0])
+    assert match, refused
+    assert 200 < int(match[2]) < 1000
 
 
 @pytest.mark.parametrize("late_ms", [0.9, 1.0, 7.5, 300.0, 1000.0, 3000.0])
-def test_a_loop_that_cannot_catch_up_skips_missed_ticks(late_ms: float) -> None:
+def test_slow_loops_skip_missed_ticks(late_ms: float) -> None:
     """Late by n periods at tick 500, the next tick is 500 + n, or the last one of the run."""
     clock = LateClock({500: int(late_ms * 1e6)})
     alone = Alone(clock)
     alone.run(catches_up=False)
     missed = min(int(late_ms), 2000 - 1 - 500)
-    made = [state.tick for state in alone.states]
-    assert made == [*range(500), *range(500 + missed, 2000)]
-    assert [state.t_ns for state in alone.states] == [tick * 1_000_000 for tick in made]
+    ticks = [state.tick for state in alone.states]
+    assert ticks == [*range(500), *range(500 + missed, 2000)]
+    assert [state.t_ns for state in alone.states] == [tick * 1_000_000 for tick in ticks]
     assert alone.stats.overruns == missed + (late_ms == 3000.0)  # it woke when the run was over
     numbers = [stats.tick // 100 for stats in alone.links]
     assert numbers == [n for n in range(20) if n < 5 or n >= (500 + missed) // 100]

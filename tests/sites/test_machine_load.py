@@ -12,7 +12,7 @@ BEFORE = "cpu  100 0 50 800 50 0 0 0 0 0\ncpu0 1 1 1 1 1 1 1 1 1 1\n"
 
 
 class MeteredClock(ManualClock):
-    """A clock that writes the next statistics of the system when somebody sleeps."""
+    """A clock that writes the next statistics of the system at each sleep."""
 
     def __init__(self, path: Path, after: str) -> None:
         super().__init__()
@@ -43,12 +43,12 @@ def test_the_share_of_time_is_measured(
     assert clock.monotonic_ns() == MEASURED_NS
 
 
-def test_without_statistics_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_statistics_no_load_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_load, "_STATISTICS", Path("/nowhere"))
     assert describe_load(measure_busy_share(ManualClock())) == ""
 
 
-def test_a_warning_is_one_sentence_that_says_what_to_do() -> None:
+def test_warnings_are_one_sentence_with_advice() -> None:
     assert describe_load(0.5) == ""
     warning = describe_load(0.97)
     assert "97% busy" in warning or "97 % busy" in warning

@@ -1,4 +1,4 @@
-"""What a person sees of a session comes from its sites; what strangers say is nobody's."""
+"""A monitor shows the messages of a session's sites, and ignores those of strangers."""
 
 import io
 
@@ -25,7 +25,7 @@ STATISTICS = LoopStats(SITE, 1).pop_stats(SITE.step(TickInput(0)))
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
+def test_strangers_messages_are_shown_or_ignored(terminal: bool) -> None:
     moved = trilat_net.simulate(SCENARIO, duration_s=0.01)["m1"]
     network, clock = LocalNetwork(), ManualClock()
     mine, out = network.join(), io.StringIO()

@@ -1,4 +1,4 @@
-"""The benchmark of a network: what it measures over networks that are known, and what it makes of that."""
+"""The benchmark of a network: its measurements over known networks, and its conclusions."""
 
 import json
 import threading
@@ -29,7 +29,7 @@ MS = 1_000_000
 
 
 class SlowFarEnd:
-    """Sends back every sample but some, a time after it came."""
+    """Returns every sample but some, after a fixed time."""
 
     def __init__(
         self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0
@@ -75,7 +75,7 @@ def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
     assert took_ns <= 700 * MS + 35 * MS
 
 
-def test_nobody_there_is_said() -> None:
+def test_an_absent_far_end_is_reported() -> None:
     relay, network = Relay(), LocalNetwork()
     relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").wait_for_far_end())
     assert relay.run()["near"] is False
@@ -83,16 +83,18 @@ def test_nobody_there_is_said() -> None:
 
 def row(needs, p99_ms: float, lost: int = 0) -> dict:
     times = {"p50": 500 * p99_ms, "p99": 1e3 * p99_ms, "max": 2e3 * p99_ms}
-    own = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
-    return {**own, "lost": lost, "one_way_us": times}
+    facts = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
+    return {**facts, "lost": lost, "one_way_us": times}
 
 
 @pytest.mark.long
-def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
-    """P+d at 200 ms holds up to 229.8 ms, docs/studies/linear.md, and its links hide what is shorter than theirs."""
+def test_delay_margins_judge_a_network() -> None:
+    """P+d at 200 ms tolerates up to 229.8 ms, docs/studies/linear.md, and its links hide shorter delays."""
     needs = find_needs(tn.load_scenario("p_d_margin"))
     margin = tn.linear("p_d_margin", ports=False).to_dict()["margin"]["stable"]
-    assert needs.stable_ms == [[1e3 * one["from_s"], 1e3 * one["to_s"]] for one in margin]
+    assert needs.stable_ms == [
+        [1e3 * window["from_s"], 1e3 * window["to_s"]] for window in margin
+    ]
     edge_ms = needs.stable_ms[0][1]
     assert edge_ms == pytest.approx(229.8, abs=0.05)
     hidden = judge_network(needs, row(needs, 150.0))
@@ -106,7 +108,7 @@ def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
     assert not judge_network(needs, {**row(needs, 1.0, lost=1000), "one_way_us": None})["good"]
 
 
-def test_a_play_out_is_what_a_measured_link_adds() -> None:
+def test_measured_links_add_their_play_out() -> None:
     needs = find_needs(
         tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40})
     )
@@ -117,7 +119,7 @@ def test_a_play_out_is_what_a_measured_link_adds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "fact"),
+    ("arguments", "fact"),
     [
         (["--figure", "a.png"], "--figure: can be used only with --benchmark"),
         (["--benchmark", "free", "--count", "9"], "--count: cannot be used with --benchmark"),
@@ -129,12 +131,12 @@ def test_a_play_out_is_what_a_measured_link_adds() -> None:
         (["--benchmark", "free", "--seconds", "0"], "--seconds"),
     ],
 )
-def test_what_has_no_meaning_is_refused(words: list[str], fact: str, tmp_path) -> None:
-    trilat("ping", *words, cwd=tmp_path).refuses(fact)
+def test_meaningless_settings_are_refused(arguments: list[str], fact: str, tmp_path) -> None:
+    trilat("ping", *arguments, cwd=tmp_path).refuses(fact)
 
 
-def check_result(found: Result, transports: list[str]) -> None:
-    facts = found.to_dict()
+def check_result(result: Result, transports: list[str]) -> None:
+    facts = result.to_dict()
     assert [one["transport"] for one in facts["transports"]] == transports
     assert len(facts["rows"]) == 6 * len(transports)
     assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
@@ -146,10 +148,10 @@ def check_result(found: Result, transports: list[str]) -> None:
             or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
         )
     assert is_documented("ping --benchmark", facts)
-    assert facts["connect"] or found.summary().startswith(
+    assert facts["connect"] or result.summary().startswith(
         "this machine alone, without a network"
     )
-    assert len(found.to_frame()) == len(facts["rows"])
+    assert len(result.to_frame()) == len(facts["rows"])
 
 
 @pytest.mark.parametrize(
@@ -159,15 +161,15 @@ def check_result(found: Result, transports: list[str]) -> None:
         (("tcp/192.0.2.1:7447",), "the network from this machine to tcp/192.0.2.1:7447"),
     ],
 )
-def test_the_first_line_says_what_was_measured(connect: tuple[str, ...], line: str) -> None:
+def test_the_first_line_names_the_measurement(connect: tuple[str, ...], line: str) -> None:
     needs = find_needs(tn.load_scenario("free"))
-    found = NetworkBenchmark("free", 1.0, needs, [], [], connect)
-    assert found.summary().startswith(line)
-    assert found.to_dict()["connect"] == list(connect)
+    network_benchmark = NetworkBenchmark("free", 1.0, needs, [], [], connect)
+    assert network_benchmark.summary().startswith(line)
+    assert network_benchmark.to_dict()["connect"] == list(connect)
 
 
 @pytest.mark.long
-def test_it_measures_loopback() -> None:
+def test_loopback_is_measured() -> None:
     ended = threading.Event()
     (endpoint,) = find_free_endpoints(1)
     far = threading.Thread(target=run_far_end, args=([endpoint], None, ended.is_set))
@@ -181,8 +183,20 @@ def test_it_measures_loopback() -> None:
 
 @pytest.mark.long
 def test_the_command_measures_all_transports_and_draws(tmp_path) -> None:
-    words = ["--benchmark", "p_d_margin", "--seconds", "3", "--figure", "network.png", "--json"]
-    facts = json.loads(trilat("ping", *words, cwd=tmp_path).out)
-    assert [one["transport"] for one in facts["transports"]] == ["tcp", "tls", "quic"]
+    arguments = [
+        "--benchmark",
+        "p_d_margin",
+        "--seconds",
+        "3",
+        "--figure",
+        "network.png",
+        "--json",
+    ]
+    facts = json.loads(trilat("ping", *arguments, cwd=tmp_path).out)
+    assert [transport["transport"] for transport in facts["transports"]] == [
+        "tcp",
+        "tls",
+        "quic",
+    ]
     assert (tmp_path / "network.png").stat().st_size > 10_000
     assert is_documented("ping --benchmark", facts)

@@ -1,4 +1,4 @@
-"""Hands and plants of one's own in a live session: the same numbers as in virtual time, bit for bit."""
+"""Users' own hands and plants in a live session: the same numbers as in virtual time, bit for bit."""
 
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ def at_m2(kind: str, **keys: Any) -> Scenario:
 
 
 def begin(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
-    """A session whose hand at m2 runs in a process of its own."""
+    """Returns a session whose hand at m2 runs in a process of its own."""
     at = find_own_hand(scenario, "m2")
     assert at is not None
     return at, Session.whole(scenario, folder)
@@ -55,7 +55,7 @@ class Thinking:
 def add_program(
     session: Session, program: HandProgram, thinks_ns: int = 0, dies_ns: int | None = None
 ) -> None:
-    """A program at m2 in a process of its own, which thinks for a time about each view."""
+    """Adds a program at m2 in a process of its own, which computes for a time over each view."""
 
     def run(clock: RelayClock) -> None:
         at = find_own_hand(session.scenario, "m2")
@@ -94,7 +94,7 @@ def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path)
     assert verify(log).passed
 
 
-def test_thinking_that_is_shorter_than_the_delay_changes_nothing(tmp_path: Path) -> None:
+def test_thinking_within_the_delay_changes_nothing(tmp_path: Path) -> None:
     scenario = at_m2("Follower", process=True, delay_ms=20.0)
     at, session = begin(scenario, tmp_path)
     add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
@@ -112,7 +112,7 @@ def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
     assert verify(log).passed
 
 
-def test_a_killed_program_lets_go_and_the_session_goes_on(tmp_path: Path) -> None:
+def test_killed_programs_let_go_without_harm(tmp_path: Path) -> None:
     scenario = at_m2("Circle", process=True)
     at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()), dies_ns=2_100 * MS_NS)
@@ -149,7 +149,7 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
     assert verify(log).passed
 
 
-def test_a_stranger_moves_no_hand_of_ones_own(tmp_path: Path) -> None:
+def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
     scenario = at_m2("Circle", process=True)
     at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()))
@@ -175,8 +175,8 @@ def test_a_stranger_moves_no_hand_of_ones_own(tmp_path: Path) -> None:
     assert any("hand: stranger" in text for text in session.said)
 
 
-def test_saying_that_it_is_here_decides_nothing(tmp_path: Path) -> None:
-    """What a program says before its first view may arrive after the site has asked."""
+def test_announcements_decide_nothing(tmp_path: Path) -> None:
+    """A message of a program before its first view may arrive after the site's request."""
     scenario = at_m2("Circle", process=True)
     at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()), thinks_ns=3 * MS_NS)
@@ -196,7 +196,7 @@ def test_saying_that_it_is_here_decides_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["raise", "nan"])
-def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> None:
+def test_hands_failing_within_sites_let_go(how: str, tmp_path: Path) -> None:
     scenario = at_m2("Failing", settings={"how": how})
     log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
@@ -208,7 +208,7 @@ def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> 
     assert log.complete
 
 
-def test_a_plant_moves_alike_live_and_in_virtual_time(tmp_path: Path) -> None:
+def test_plants_move_alike_live_and_virtually(tmp_path: Path) -> None:
     scenario = load_scenario(
         "paper", {"sites.s.plant": "tests.own_code:Arm", "duration_s": 1.0}
     )
@@ -217,7 +217,7 @@ def test_a_plant_moves_alike_live_and_in_virtual_time(tmp_path: Path) -> None:
     assert verify(log).passed
 
 
-def test_a_plant_that_fails_ends_the_run_named(tmp_path: Path) -> None:
+def test_failing_live_plants_are_named_and_end(tmp_path: Path) -> None:
     scenario = load_scenario(
         "paper", {"sites.s.plant": "tests.own_code:Torn", "duration_s": 1.0}
     )

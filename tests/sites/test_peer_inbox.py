@@ -1,4 +1,4 @@
-"""What comes in is a peer's sample, or it is counted by reason and dropped; nothing raises."""
+"""Arriving messages are a peer's samples, or are counted by reason and dropped; nothing raises."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ class Desk:
         self.clock.sleep_until(EPOCH_NS + until_ns)
 
 
-def test_samples_come_peer_by_peer_each_in_its_order() -> None:
+def test_samples_come_by_peer_in_order() -> None:
     desk = Desk()
     for tick in (0, 1, 3, 2):
         desk.send[1](payload(tick, 1))
@@ -81,7 +81,7 @@ def test_samples_come_peer_by_peer_each_in_its_order() -> None:
     assert desk.intake.drain(6_000_000) == []
 
 
-def test_a_delay_is_from_stamp_to_arrival_however_late_drained() -> None:
+def test_delay_is_stamp_to_arrival() -> None:
     desk = Desk(rates=(300, 1000))
     desk.wait(40_000_000)
     desk.send[0](payload(3, 0, sent_ns=12_345_678))
@@ -90,7 +90,7 @@ def test_a_delay_is_from_stamp_to_arrival_however_late_drained() -> None:
     assert [a.latency_us for a in desk.intake.drain(900_000_000)] == [27_654, 20_000]
 
 
-def test_what_comes_before_it_was_sent_is_counted_and_used() -> None:
+def test_early_arrivals_are_counted_and_used() -> None:
     desk = Desk()
     desk.wait(5_000_000)
     desk.send[0](payload(0, 0, sent_ns=5_000_001))
@@ -130,7 +130,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("reason", "sent"), [(r, p) for r, ps in REFUSED.items() for p in ps])
-def test_what_is_no_sample_is_counted_by_reason_and_dropped(reason: str, sent: bytes) -> None:
+def test_invalid_samples_are_counted_and_dropped(reason: str, sent: bytes) -> None:
     desk = Desk()
     # the last that is taken
     for message in (
@@ -170,7 +170,7 @@ def test_no_field_of_any_type_raises(changed: dict[str, Any]) -> None:
     assert len(arrivals) + sum(desk.dropped.values()) - desk.dropped["missing"] == 1
 
 
-def test_one_tick_takes_bounded_number_and_rest_waits_in_order() -> None:
+def test_one_tick_takes_a_bounded_number() -> None:
     desk = Desk()
     for tick in range(MAX_ARRIVALS + 10):
         desk.send[0](payload(tick, 0))
@@ -185,7 +185,7 @@ def test_one_tick_takes_bounded_number_and_rest_waits_in_order() -> None:
     ]
 
 
-def test_what_a_ring_lost_is_counted_as_missing() -> None:
+def test_lost_ring_entries_count_as_missing() -> None:
     desk = Desk(capacity=4)
     for tick in range(10):
         desk.send[0](payload(tick, 0))
@@ -193,7 +193,7 @@ def test_what_a_ring_lost_is_counted_as_missing() -> None:
     assert desk.dropped == {"missing": 6}
 
 
-def test_duplicates_are_handed_on_because_the_record_lists_them() -> None:
+def test_duplicates_are_kept_for_the_record() -> None:
     desk = Desk()
     for tick in (0, 1, 1, 0):
         desk.send[0](payload(tick, 0))
@@ -219,7 +219,7 @@ GUARDED = (
         ([1e6, 0.2], [0.0, 0.0], False),
     ],
 )
-def test_a_guarded_site_drops_what_an_arm_cannot_have_done(
+def test_guarded_sites_drop_impossible_samples(
     q: list[float], qd: list[float], taken: bool
 ) -> None:
     desk = Desk(links=GUARDED)
@@ -230,7 +230,7 @@ def test_a_guarded_site_drops_what_an_arm_cannot_have_done(
     assert desk.dropped["implausible"] == (not taken)
 
 
-def test_another_start_of_a_peer_may_be_at_any_tick() -> None:
+def test_restarted_peers_may_be_at_any_tick() -> None:
     desk = Desk(links=GUARDED)
     desk.send[0](payload(100, q=[0.5, 0.2]))
     desk.send[0](payload(20, q=[0.15, 0.2]))  # 80 ms earlier
@@ -241,7 +241,7 @@ def test_another_start_of_a_peer_may_be_at_any_tick() -> None:
     assert not desk.dropped["implausible"]
 
 
-def test_a_guarded_site_takes_no_stamp_a_second_ahead() -> None:
+def test_guarded_sites_refuse_stamps_one_second_ahead() -> None:
     for links, ahead in ((GUARDED, [1000]), (SETUP.links, [1000, 1001])):
         desk = Desk(links=links)
         for tick in (1000, 1001):

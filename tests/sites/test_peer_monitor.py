@@ -1,4 +1,4 @@
-"""Who else is there: starts of other sessions do not count, but a recorder may come at any time."""
+"""Presence of members: starts of other sessions do not count, but a recorder may come at any time."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import pytest
 
 from sites.peer_monitor import PeerMonitor
 from tests.net.local_bus import LocalBus, LocalNetwork
-from tests.net.parties import told
+from tests.net.parties import answer_info
 from trilat_net.net import topics
 from trilat_net.net.membership import EventPublisher, liveliness_token, read_messages
 from trilat_net.net.messages import Event
@@ -16,13 +16,13 @@ BOOTS = {"m1": 1, "m2": 2, "s": 3, topics.RECORDER: 9}
 
 
 class Desk:
-    """The site m1, its company, and what it says of it."""
+    """The site m1, its peers, and its reports about them."""
 
     def __init__(self) -> None:
         self.network = LocalNetwork()
         self._heard = self.network.join().inbox(topics.key("t", "m1", topics.EVENT))
         bus = self.network.join()
-        self._publisher = EventPublisher(bus, "t", told("m1", 1))
+        self._publisher = EventPublisher(bus, "t", answer_info("m1", 1))
         self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
         self.company.boots = BOOTS
 
@@ -56,7 +56,7 @@ class Desk:
         (22, "diverged", [], ""),  # another start is nobody
     ],
 )
-def test_peer_that_goes_is_lost_unless_it_said_its_end(
+def test_departed_peers_are_lost_without_an_end(
     boot: int, event: str, news: list[tuple[str, str]], ended_by: str
 ) -> None:
     desk = Desk()
@@ -68,7 +68,7 @@ def test_peer_that_goes_is_lost_unless_it_said_its_end(
     assert (desk.told(), desk.company.ended_by) == (news, ended_by)
 
 
-def test_a_later_recorder_is_told_of_and_counted() -> None:
+def test_later_recorders_are_reported_and_counted() -> None:
     desk = Desk()
     first = desk.comes(topics.RECORDER, 9)
     assert desk.told() == []
@@ -81,7 +81,7 @@ def test_a_later_recorder_is_told_of_and_counted() -> None:
     assert desk.company.recorders == {"10"}
 
 
-def test_a_recorder_has_all_when_it_says_so() -> None:
+def test_recorders_report_themselves_complete() -> None:
     desk = Desk()
     desk.says(topics.RECORDER, 9, "stored", about="m1", ticks=4)
     desk.says(topics.RECORDER, 9, "stored", about="m2", ticks=5)

@@ -1,4 +1,4 @@
-"""Every step warns and goes on: what a process obtained is said, whatever it was."""
+"""Every step of the real-time setup warns and continues, and reports the obtained settings."""
 
 import json
 import os
@@ -30,7 +30,7 @@ def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool
     return tuple(json.loads(done.stdout))
 
 
-def test_every_step_says_what_it_obtained_and_pins_its_process() -> None:
+def test_steps_report_settings_and_pin_processes() -> None:
     cpu = min(os.sched_getaffinity(0))
     obtained, collecting, cpus = prepared(cpu)
     assert list(obtained) == ["affinity", "timer_slack", "memory", "scheduling", "collector"]
@@ -42,9 +42,7 @@ def test_every_step_says_what_it_obtained_and_pins_its_process() -> None:
 
 
 @pytest.mark.parametrize("cpu", [-1, 1023, 2**80])
-def test_a_processor_that_is_not_there_is_a_warning(
-    cpu: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_processor_is_a_warning(cpu: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "request_real_time_scheduling", lambda: "")
     for step in ("_call_libc", "_stop_collector"):
         monkeypatch.setattr(realtime, step, lambda *_, **__: "")
@@ -54,7 +52,7 @@ def test_a_processor_that_is_not_there_is_a_warning(
 REFUSE = "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
 
 
-def test_without_any_privilege_the_loop_runs_as_it_can() -> None:
+def test_without_privileges_the_loop_still_runs() -> None:
     refuse = f"{REFUSE}os.sched_setscheduler = os.setpriority = realtime._call_libc = refuse"
     obtained, collecting, _ = prepared(before=refuse)
     assert obtained["scheduling"].startswith("normal (")
@@ -96,8 +94,8 @@ print(json.dumps([policy(0), [policy(thread) for thread in beside]]))
 """
 
 
-def test_threads_beside_a_loop_give_back_the_interpreter_at_once() -> None:
-    """Of all that is not a loop nothing comes before it; else it keeps what the loop waits for."""
+def test_other_threads_return_the_interpreter_at_once() -> None:
+    """No other thread precedes the loop; otherwise it would keep the interpreter while the loop waits."""
     program = f"{PROGRAM.format(before=BESIDE, cpu=None)}{POLICIES}"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60

@@ -1,4 +1,4 @@
-"""A site's memory of what it has published: bounded, exact, and told in bounded chunks."""
+"""A site's memory of its published messages: bounded, exact, and sent in bounded chunks."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -54,10 +54,10 @@ memories = {
 
 
 @given(**memories, first=st.integers(0, 400), length=st.integers(1, 400))
-def test_a_ring_tells_what_it_still_has_in_chunks(
+def test_rings_send_their_content_in_chunks(
     capacity: int, size_bytes: int, sizes: list[int], first: int, length: int
 ) -> None:
-    """Asked again and again from behind what it has told, it tells exactly what is left of a range."""
+    """Repeated requests from behind the last answer return exactly the remaining part of a range."""
     ring = ChannelBuffer(capacity, size_bytes)
     payloads = [str(n).encode()[-size:].zfill(size) for n, size in enumerate(sizes)]
     for payload in payloads:
@@ -77,10 +77,10 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
 
 
 @given(**memories)
-def test_a_ring_forgets_no_more_than_it_must(
+def test_rings_forget_as_little_as_possible(
     capacity: int, size_bytes: int, sizes: list[int]
 ) -> None:
-    """What is left fills the memory, but for the piece of a message at its end, or the places."""
+    """The rest fills the memory, except a piece of a message at its end, or fills the places."""
     ring = ChannelBuffer(capacity, size_bytes)
     for size in sizes:
         ring.store(b"x" * size)
@@ -91,7 +91,7 @@ def test_a_ring_forgets_no_more_than_it_must(
         assert sum(sizes[ring.oldest - 1 :]) > size_bytes - 3000
 
 
-def test_every_channel_is_told_apart() -> None:
+def test_channels_are_sent_separately() -> None:
     desk = Desk()
     for n, ring in enumerate(desk.history.channels.values()):
         for m in range(n + 2):
@@ -116,14 +116,14 @@ def test_memory_holds_a_minute_and_no_more() -> None:
 
 
 def test_the_largest_messages_fit_an_answer() -> None:
-    """One message is always told, however large it is."""
+    """One message is always sent, however large it is."""
     desk = Desk()
     for _ in range(3):
         desk.history.channels[topics.EVENT].store(b"x" * MAX_BYTES)
     assert [len(payload) for payload in desk.told(topics.EVENT, 0, 9).payloads] == [MAX_BYTES]
 
 
-def test_nobody_is_answered_who_does_not_ask_properly() -> None:
+def test_invalid_requests_get_no_answer() -> None:
     desk = Desk()
     good = BackfillRequest(channel="state", first=0, last=3)
     for payload in (

@@ -1,4 +1,4 @@
-"""A running session from Python: the shares of a site as they are at present."""
+"""A running session from Python: the present shares of a site."""
 
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from .relay import RelayClock
 from .sessions import Session, reached
 
 
-def test_shares_are_those_of_now_also_for_who_comes_late(tmp_path: Path) -> None:
-    """More than half of the ramp from 0.5 to 0.9 is over when somebody asks who heard of no change."""
+def test_shares_are_current_for_latecomers_too(tmp_path: Path) -> None:
+    """More than half of the ramp from 0.5 to 0.9 is over when a member asks that has heard of no change."""
     scenario = load_scenario("play", {"duration_s": 4.0, "rate_hz": 200})
     session, told = Session.whole(scenario, tmp_path), dict[str, dict[str, float]]()
 

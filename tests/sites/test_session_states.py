@@ -1,4 +1,6 @@
-"""What a running session shows to programs: its newest states, what one site knows, marks and episodes."""
+"""States of a running session for programs: the newest states, the knowledge of one site, marks
+and episodes.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -54,10 +56,14 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
     log = open_log(session.path)
     # it listens for longer than the delay
     for one, true in list(zip(seen, newest, strict=True))[5:]:
-        own = one["m1"]
+        own_state = one["m1"]
         for peer in ("m2", "s"):
-            assert one[peer].tick == own.used[peer] == log["m1"].states[own.tick].used[peer]
-            assert np.array_equal(one[peer].q, log[peer].q[own.used[peer]])
+            assert (
+                one[peer].tick
+                == own_state.used[peer]
+                == log["m1"].states[own_state.tick].used[peer]
+            )
+            assert np.array_equal(one[peer].q, log[peer].q[own_state.used[peer]])
             assert true[peer].tick - one[peer].tick >= 120 - 11  # records come ten at a time
     assert seen
 
@@ -76,8 +82,8 @@ def test_marks_and_episodes_stand_in_the_log(tmp_path: Path) -> None:
 
     session.relay.add("program", run)
     session.play()
-    told = [event.text for event in open_log(session.path).events if event.kind == "mark"]
+    texts = [event.text for event in open_log(session.path).events if event.kind == "mark"]
     ends = ["succeeded", "failed", "ended"]
     named = zip(("one", "two", "three"), ends, strict=True)
     marked = [f"episode {name} {what}" for name, end in named for what in ("begins", end)]
-    assert told == ["look here", *marked]
+    assert texts == ["look here", *marked]

@@ -66,7 +66,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
 GLIDES = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 20.0}
 
 
-def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> None:
+def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
     session = Session.whole(
         load_scenario("two_sites", {"duration_s": 4.0, **GLIDES}), tmp_path, ends={}
     )
@@ -136,7 +136,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
     assert verify(log).identical == 8000
 
 
-def test_site_whose_peers_are_too_far_says_so_once_second(tmp_path: Path) -> None:
+def test_sites_too_far_apart_report_once(tmp_path: Path) -> None:
     """Their start poses are 0.4 rad apart."""
     rule = {**GLIDES, "on_stale.align_limit_rad": 0.05, "duration_s": 3.2}
     log = Session.whole(load_scenario("two_sites", rule), tmp_path).run()
@@ -147,7 +147,7 @@ def test_site_whose_peers_are_too_far_says_so_once_second(tmp_path: Path) -> Non
     assert set(log["s"].mode) == {"waiting"}
 
 
-def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
+def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
     session = Session.whole(load_scenario("two_sites", {"duration_s": 2.0}), tmp_path, ends={})
     said: list[str] = []
 
@@ -164,13 +164,13 @@ def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
     assert "trilat stop --end" in said[0]
 
 
-def test_a_session_that_is_not_there_is_not_stopped() -> None:
+def test_an_absent_session_is_not_stopped() -> None:
     with pytest.raises(SessionError, match="no site of session"):
         reached(LocalNetwork().join(), ManualClock()).end()
 
 
 @pytest.mark.long
-def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> None:
+def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "rate_hz": 200}
     session = Session.whole(
         load_scenario("paper", {"duration_s": 60.0, **glide}), tmp_path, ends={}
@@ -207,8 +207,8 @@ def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> Non
 
 
 @pytest.mark.long
-def test_master_that_is_killed_is_done_without_and_taken_back(tmp_path: Path) -> None:
-    """It dies 3 s after the beginning and is started again 4 s later; the others never hold."""
+def test_killed_masters_are_replaced_and_return(tmp_path: Path) -> None:
+    """The master dies 3 s after the beginning and is started again 4 s later; the others never hold."""
     rule = {**GLIDES, "on_stale.on_lost": "degrade", "rate_hz": 200, "duration_s": 12.0}
     session = Session.whole(load_scenario("paper", rule), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4_000_000_000

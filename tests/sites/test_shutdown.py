@@ -1,4 +1,4 @@
-"""The end of a site: with `stay_s` the recorder leaves first, and nothing but the wait hangs on it."""
+"""The end of a site: with `stay_s` the recorder leaves first, and only the wait depends on `stay_s`."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ S = 1_000_000_000
 
 
 def ending(folder: Path, stay_s: float) -> Session:
-    """A session of two sites whose recorder works on for half a minute when it has all."""
+    """A session of two sites whose recorder works on for half a minute when it has every record."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
     return Session.whole(scenario, folder, stay_s=stay_s, works_ns=30 * S, ends={})
 
@@ -51,7 +51,7 @@ def test_how_long_a_site_stays(
         assert least_s * S < session.left_ns[name] - session.left_ns[after] < most_s * S
 
 
-def test_signal_ends_wait_and_spoils_no_run_that_was_complete(tmp_path: Path) -> None:
+def test_signals_end_waits_without_spoiling_complete_runs(tmp_path: Path) -> None:
     session = ending(tmp_path, 120.0)
 
     def ask(clock: RelayClock) -> None:
@@ -65,8 +65,8 @@ def test_signal_ends_wait_and_spoils_no_run_that_was_complete(tmp_path: Path) ->
     assert max(session.left_ns["m"], session.left_ns["s"]) < session.left_ns["recorder"]
 
 
-def test_a_site_that_is_interrupted_waits_for_every_recorder(tmp_path: Path) -> None:
-    """One has all at once; another, which has come late, still asks for what was before."""
+def test_interrupted_sites_wait_for_all_recorders(tmp_path: Path) -> None:
+    """One recorder has every record at once; another, which has come late, still asks for earlier ones."""
     scenario = load_scenario("two_sites", {"duration_s": 9.0})
     session = Session.whole(scenario, tmp_path, ends={})
 

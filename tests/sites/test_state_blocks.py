@@ -1,4 +1,4 @@
-"""Samples go to peers at every tick, records to recorders in blocks: the two say the same."""
+"""Samples go to peers at every tick, records to recorders in blocks, with equal contents."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,14 +22,14 @@ from .sessions import SESSION, Session, in_log, in_virtual_time
 A_SECOND = 1_000_000_000
 
 
-def taken(inbox: Inbox) -> list[bytes]:
+def take_payloads(inbox: Inbox) -> list[bytes]:
     return [message[1] for message in iter(inbox.poll, None)]
 
 
-def heard(
+def listen_to_sites(
     session: Session, sites: Sequence[str]
 ) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
-    """What others hear of every site until the session is over: its samples, its blocks."""
+    """Returns the messages of every site until the session is over: samples and blocks."""
     samples: dict[str, list[bytes]] = {}
     blocks: dict[str, list[bytes]] = {}
 
@@ -38,7 +38,7 @@ def heard(
         rings = {key: bus.inbox(topics.key(SESSION, *key)) for key in keys}
         clock.sleep_until(clock.monotonic_ns() + 8 * A_SECOND)
         for (name, channel), ring in rings.items():
-            (samples if channel == topics.SAMPLE else blocks)[name] = taken(ring)
+            (samples if channel == topics.SAMPLE else blocks)[name] = take_payloads(ring)
 
     session.stranger(listen)
     return samples, blocks
@@ -53,11 +53,9 @@ def heard(
     ],
     ids=["two joints", "four ticks a millisecond", "six joints"],
 )
-def test_samples_are_records_and_blocks_hold_ten_milliseconds(
-    scenario: Scenario, tmp_path: Path
-) -> None:
+def test_samples_are_records_and_blocks_hold_10_ms(scenario: Scenario, tmp_path: Path) -> None:
     session = Session.whole(scenario, tmp_path)
-    samples, blocks = heard(session, scenario.names)
+    samples, blocks = listen_to_sites(session, scenario.names)
     log = session.run()
     assert verify(log).passed
     assert in_log(log) == in_virtual_time(scenario)

@@ -1,4 +1,6 @@
-"""What is in the file at any time of a session, and after a full disk; parts of a session are the session."""
+"""The content of the file during a session, and after a full disk; the parts of a session are
+the session.
+"""
 
 from collections import Counter
 from pathlib import Path
@@ -35,7 +37,7 @@ def records(path: Path) -> dict[str, int]:
         return Counter(item.topic for item in McapReader(stream, str(path)).messages())
 
 
-def test_records_sent_100_ms_before_a_crash_are_filed(tmp_path: Path) -> None:
+def test_records_100_ms_before_a_crash_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     session = session_of(tmp_path, 0.4)
     looks: list[tuple[int, int]] = []
@@ -77,12 +79,12 @@ def test_on_a_full_disk_accounts_match_the_file(
     assert verdict.agreed
     assert verdict.integrity.passed
     assert not verdict.passed  # no site could say how it ended
-    found = records(path)
+    stored = records(path)
     for name in SITES:
         assert [state.tick for state in log[name].states] == list(range(len(log[name])))
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             topic = "/" + topics.key(SESSION, name, channel)
-            assert f"received {found[topic]}, missing 0" in log.accounts[topic]
+            assert f"received {stored[topic]}, missing 0" in log.accounts[topic]
     assert session.relay.results == dict.fromkeys(SITES, 0)  # the sites went on
 
 
@@ -110,7 +112,7 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
         assert any(f"received {known}, missing 0" in said for known in (made, made + 1))
 
 
-def test_what_is_left_out_is_neither_in_file_nor_missing(tmp_path: Path) -> None:
+def test_excluded_channels_are_neither_stored_nor_missing(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     choice = ChannelFilter(("**/m/**", "**/s/event"), ("**/link",))
     log = session_of(tmp_path, 0.3, LogStorage(path, choice=choice)).run()

@@ -1,4 +1,4 @@
-"""A visitor of a party: a ping of a session that is on its way or runs, on the party's clock."""
+"""A visitor of a party: a ping of a session that starts or runs, on the party's clock."""
 
 from collections.abc import Callable
 from functools import partial
@@ -38,8 +38,8 @@ def link_stats() -> LinkStats:
         name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")
     }
     zeros = dict.fromkeys(("overruns", "late_max_us", "busy_max_us"), 0)
-    own = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
-    return LinkStats(**own, **counts, **zeros, delay_us={"s": 120})
+    facts = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
+    return LinkStats(**facts, **counts, **zeros, delay_us={"s": 120})
 
 
 def ping_sites() -> PingReport:
@@ -70,7 +70,7 @@ class Publishers:
 
 
 def ping_publishers(lasts_s: float = 2.0) -> TopicDelays:
-    """What is measured of these publishers, a message every 10 ms."""
+    """Returns the measured delays of these publishers, a message every 10 ms."""
     graph, clock = Publishers(), ManualClock(0, 10**18)
     stopped = partial(graph.publish, clock)
     return ping_topic(graph, clock, "chatter", lasts_s, stopped)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The worker pool: every item once, in few batches, whatever becomes of its workers."""
+"""The worker pool: every item once, in few batches, whatever happens to its workers."""
 
 import os
 import signal
@@ -21,17 +21,17 @@ from trilat_net.work.executor import (
 
 
 def test_any_executor_gives_the_results_of_this_process() -> None:
-    shown: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     with ThreadPoolExecutor(3) as threads, open_worker_pool(None, threads) as pool:
-        assert pool.map(abs, range(-50, 0), lambda *one: shown.append(one)) == list(
+        assert pool.map(abs, range(-50, 0), lambda *one: progress.append(one)) == list(
             range(50, 0, -1)
         )
-    assert shown == [(n, 50) for n in range(1, 51)]
+    assert progress == [(n, 50) for n in range(1, 51)]
     with open_worker_pool(1) as pool:
         assert list(pool.iterate_results(abs, [-3, 2])) == [(0, 3), (1, 2)]
 
 
-def test_few_items_are_taken_at_time_however_many_there_are() -> None:
+def test_few_items_are_taken_at_a_time() -> None:
     taken: list[int] = []
 
     def items() -> Iterator[int]:
@@ -47,7 +47,7 @@ def test_few_items_are_taken_at_time_however_many_there_are() -> None:
     assert len(taken) < 2000
 
 
-def test_batches_fit_the_measured_time_and_shrink_at_the_end() -> None:
+def test_batches_fit_measured_times_and_shrink() -> None:
     feed = _Feed(range(2000), 2000, 2)
     assert len(feed.pop_batch(idle=True)) == 1
     feed.add_timing(10, 0.2)
@@ -69,7 +69,7 @@ def failing(n: int) -> int:
     return n
 
 
-def test_an_error_comes_after_the_results_before_it() -> None:
+def test_errors_come_after_earlier_results() -> None:
     with ThreadPoolExecutor(1) as threads:
         results = WorkerPool(threads, 1).iterate_results(failing, range(9))
         assert [next(results) for _ in range(5)] == [(n, n) for n in range(5)]
@@ -85,7 +85,7 @@ def killed_once(flag: Path, n: int) -> int:
 
 
 class FragileExecutor(Executor):
-    """Breaks for good, as a pool of processes does, by the batch that holds item 7."""
+    """A pool that breaks for good, like a pool of processes, at the batch that holds item 7."""
 
     def __init__(self) -> None:
         self.broken = False
@@ -114,8 +114,8 @@ def test_an_item_that_ends_every_worker_is_named() -> None:
     pool = WorkerPool(FragileExecutor(), 2, FragileExecutor, hint="; what to do")
     with pytest.raises(RunFailed, match=f"^{MAX_LOSSES} .* while running 7; what to do$"):
         pool.map(abs, range(30))
-    found = dict(pool.iterate_results(abs, range(30), lambda item: -item))
-    assert found == {n: -7 if n == 7 else n for n in range(30)}
+    results = dict(pool.iterate_results(abs, range(30), lambda item: -item))
+    assert results == {n: -7 if n == 7 else n for n in range(30)}
 
 
 def test_jobs_belong_to_this_machine() -> None:
@@ -125,14 +125,14 @@ def test_jobs_belong_to_this_machine() -> None:
 
 
 def compute_together(items: Sequence[int]) -> Any:
-    """Roots, several at once; an item below zero is an error."""
+    """Returns roots, several at once; an item below zero is an error."""
     for item in items:
         if item < 0:
             raise ValueError(item)
         yield float(item) ** 0.5
 
 
-def test_items_together_are_yielded_up_to_the_first_error() -> None:
+def test_batches_are_yielded_up_to_errors() -> None:
     results = WorkerPool(None, 1).iterate_results(
         abs, [4, 9, 16, -1, 25], together=compute_together, together_count=3
     )

@@ -22,7 +22,7 @@ POSE = (-0.6, 1.8)
 def section_of(
     name: str, overrides: tuple[tuple[str, Any], ...] = (), of: str | None = None
 ) -> PortAnalysis:
-    """The analysis of the ports of a shipped scenario about POSE; () is an empty list."""
+    """Returns the analysis of the ports of a shipped scenario about POSE; () is an empty list."""
     scenario = load_scenario(
         name, {key: [] if value == () else value for key, value in overrides}
     )
@@ -30,7 +30,7 @@ def section_of(
 
 
 def criterion(network: Network) -> Minima:
-    """Where the two ports of a network fail Llewellyn's criterion."""
+    """Returns the frequencies at which the two ports of a network fail Llewellyn's criterion."""
     Y = build_admittance(network.loop)
     return find_minima(
         lambda w: llewellyn_parameter(Y(w)),

@@ -1,7 +1,7 @@
 """The delay-differential equations of arms that are chains, on Pinocchio's dynamics.
 
-Nothing of `trilat_net.core` is in here. `python -m tests.theory.chain_delay_equations` makes
-`chain_motion.json` anew: the motion of `PUSHED` at `TIMES_S`, for tests without Pinocchio.
+Nothing is imported from `trilat_net.core`. `python -m tests.theory.chain_delay_equations`
+writes `chain_motion.json`: the motion of `PUSHED` at `TIMES_S`, for tests without Pinocchio.
 """
 
 import json
@@ -49,7 +49,7 @@ class ChainEquations(DelayEquations):
 
 
 def chain_equations(scenario: Scenario) -> ChainEquations:
-    """The equations of a scenario whose arms are one file, with gravity down along -z."""
+    """Returns the equations of a scenario whose arms are one file, with gravity down along -z."""
     arm, *others = [spec.arm for spec in scenario.sites.values()]
     assert all(other == arm for other in others)
     chain = read_urdf(scenario.urdf[arm.urdf], arm.base, arm.tip)

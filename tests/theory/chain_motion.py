@@ -15,7 +15,7 @@ TIMES_S = np.arange(1, 21) / 10.0
 
 
 def pushed_chains(**changes: Any) -> Scenario:
-    """From rest in three poses; the first arm is pushed at every joint."""
+    """Returns the scenario from rest in three poses; the first arm is pushed at every joint."""
     push = {
         "kind": "pulse",
         "start_s": 0.5,
@@ -26,6 +26,6 @@ def pushed_chains(**changes: Any) -> Scenario:
 
 
 def exact_motion() -> Array:
-    """q at `TIMES_S`, shape (3, 20, 6), rad."""
+    """Returns q at `TIMES_S`, shape (3, 20, 6), rad."""
     stored: Array = np.array(json.loads(PATH.read_text())["q"])
     return stored

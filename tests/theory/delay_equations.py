@@ -1,6 +1,8 @@
-"""The delay-differential equations of the paper, written from the paper and solved by another method.
+"""The delay-differential equations of the paper, written from the paper and solved by another
+method.
 
-Nothing of `trilat_net.core` is in them: SciPy's DOP853 with dense output, by the method of steps.
+Nothing is imported from `trilat_net.core`: SciPy's DOP853 with dense output, by the method of
+steps.
 """
 
 from bisect import bisect_right
@@ -46,7 +48,7 @@ def inertia(theta: Array, q: Array) -> Array:
 
 
 def regressor(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
-    """Y(q, qd, v, a) of Eq. (12), shape (..., 2, 5): what C multiplies is v."""
+    """Returns Y(q, qd, v, a) of Eq. (12), shape (..., 2, 5): C multiplies v."""
     c2, s2 = np.cos(q[..., 1]), np.sin(q[..., 1])
     g1, g12 = g * np.cos(q[..., 0]), g * np.cos(q[..., 0] + q[..., 1])
     v1, v2, a1, a2 = v[..., 0], v[..., 1], a[..., 0], a[..., 1]
@@ -87,7 +89,7 @@ class DelayEquations:
         return 2 * self.joints + len(self.theta)
 
     def past(self, t: float) -> Array:
-        """The state at t, shape (N, width); before the start the start pose, at rest."""
+        """Returns the state at t, shape (N, width); before the start the start pose, at rest."""
         if t <= 0 or not self.pieces:
             return np.hstack([self.q0, np.zeros((len(self.q0), self.width - self.joints))])
         return self.pieces[bisect_right(self.starts, t) - 1](t).reshape(-1, self.width)
@@ -105,7 +107,9 @@ class DelayEquations:
     def accelerate(
         self, q: Array, qd: Array, e: Array, ed: Array, r: Array, estimate: Array, pushed: Array
     ) -> tuple[Array, Array]:
-        """The accelerations under the law's torque and the operators', and Y'r: of the planar arm."""
+        """Returns the accelerations under the law's torque and the operators', and Y'r, of the
+        planar arm.
+        """
         Y = regressor(self.g, q, qd, -self.Lambda * e, -self.Lambda * ed)
         tau = (Y @ estimate[..., None])[..., 0] - self.Kp * r - self.Kd * ed
         # C qd + G, Eq. (5)
@@ -115,7 +119,7 @@ class DelayEquations:
         return qdd, (Y.swapaxes(1, 2) @ r[..., None])[..., 0]
 
     def solve(self, end_s: float) -> "DelayEquations":
-        """Method of steps: one piece per delay, and no piece across an edge of a pulse."""
+        """Solves by the method of steps: one piece per delay, and no piece across an edge of a pulse."""
         step = self.delay_s or 0.2
         steps = np.arange(1, round(end_s / step) + 1) * step
         cuts = sorted(
@@ -132,14 +136,14 @@ class DelayEquations:
         return self
 
     def at(self, times: Array) -> Array:
-        """States at sorted times, shape (N, K, width)."""
+        """Returns states at sorted times, shape (N, K, width)."""
         piece = np.searchsorted(self.starts, times, side="right") - 1
         parts = [self.pieces[p](times[piece == p]) for p in np.unique(piece)]
         return np.hstack(parts).reshape(len(self.q0), self.width, -1).swapaxes(1, 2)
 
 
 def equations(scenario) -> DelayEquations:
-    """The equations of a scenario whose arms, gains and delays are all alike."""
+    """Returns the equations of a scenario whose arms, gains and delays are all alike."""
     specs = list(scenario.sites.values())
     assert all((spec.arm, spec.control) == (specs[0].arm, specs[0].control) for spec in specs)
     arm = specs[0].arm
@@ -147,7 +151,7 @@ def equations(scenario) -> DelayEquations:
 
 
 def common_terms(scenario) -> dict[str, Any]:
-    """What the equations have of a scenario, whatever its arms are."""
+    """Returns the terms of the equations that do not depend on the arms of a scenario."""
     specs = list(scenario.sites.values())
     (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
     control = specs[0].control
@@ -181,18 +185,24 @@ def common_terms(scenario) -> dict[str, Any]:
 
 @cache
 def exact(name: str) -> DelayEquations:
-    """The exact solution of a shipped scenario."""
+    """Returns the exact solution of a shipped scenario."""
     return equations(load_scenario(name)).solve(DURATION_S)
 
 
 @cache
 def distance(name: str, scheme: str, rate_hz: int) -> float:
-    """max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
-    made = sampled(load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S)
-    return float(np.abs(made[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]).max())
+    """Returns max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
+    trajectory_at_times = sampled(
+        load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S
+    )
+    return float(
+        np.abs(
+            trajectory_at_times[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]
+        ).max()
+    )
 
 
 def order(name: str, scheme: str) -> list[float]:
-    """Of the distance from 500 Hz to 1 kHz, and from there to 2 kHz."""
+    """Returns the orders of the distance from 500 Hz to 1 kHz, and from there to 2 kHz."""
     errors = [distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
     return [float(np.log2(coarse / fine)) for coarse, fine in pairwise(errors)]

@@ -20,12 +20,12 @@ Array = NDArray[np.float64]
 
 
 def cumulative(values: Array, h: float) -> Array:
-    """Integral from the first tick on, by the trapezoid rule on the ticks."""
+    """Returns the integral from the first tick on, by the trapezoid rule on the ticks."""
     return np.concatenate([[0.0], np.cumsum(0.5 * h * (values[1:] + values[:-1]))])
 
 
 def delayed(values: Array, ticks: int, before: float = 0.0) -> Array:
-    """The values `ticks` ago; before the start, what the history holds."""
+    """Returns the values `ticks` ago; before the start, those of the history."""
     past = np.full_like(values, before)
     past[ticks:] = values[: len(values) - ticks] if ticks else values
     return past
@@ -33,7 +33,7 @@ def delayed(values: Array, ticks: int, before: float = 0.0) -> Array:
 
 @dataclass(frozen=True)
 class Balance:
-    """V, what the dissipation took and what the hands gave, each over the ticks and weighted by beta."""
+    """V, the dissipation and the work of the hands, each over the ticks and weighted by beta."""
 
     V: Array
     taken: Array
@@ -46,7 +46,7 @@ class Balance:
 
 
 def left_null_vector(scenario) -> Array:
-    """beta of Eq. (20) from NumPy's singular vectors, sum 1."""
+    """Returns beta of Eq. (20) from NumPy's singular vectors, sum 1."""
     names = list(scenario.sites)
     alpha = np.array([[scenario.dominance[i].get(j, 0.0) for j in names] for i in names])
     beta = np.linalg.svd((alpha - np.eye(len(names))).T)[2][-1]
@@ -54,7 +54,7 @@ def left_null_vector(scenario) -> Array:
 
 
 def balance(run: Run, beta: Array) -> Balance:
-    """Books a run whose sites share one rate."""
+    """Computes the balance of a run whose sites share one rate."""
     scenario = run.scenario
     names = list(scenario.sites)
     rate_hz = scenario.sites[names[0]].rate_hz
@@ -75,8 +75,10 @@ def balance(run: Run, beta: Array) -> Balance:
             ticks = round(scenario.links[f"{peer}->{name}"].delay_ms * 1e-3 * rate_hz)
             norm = cumulative((Kd * qd**2).sum(1), h)
             v += share * (norm - delayed(norm, ticks))
-            came = np.stack([delayed(qd[:, joint], ticks) for joint in (0, 1)], axis=1)
-            loss += 0.5 * share * (Kd * (site.qd - came) ** 2).sum(1)
+            delayed_speeds = np.stack(
+                [delayed(qd[:, joint], ticks) for joint in (0, 1)], axis=1
+            )
+            loss += 0.5 * share * (Kd * (site.qd - delayed_speeds) ** 2).sum(1)
         V = V + weight * 0.5 * v
         taken = taken + weight * cumulative(loss, h)
         given = given + weight * cumulative((r * -site.tau_x).sum(1), h)
@@ -84,13 +86,15 @@ def balance(run: Run, beta: Array) -> Balance:
 
 
 def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Balance:
-    """The balance of a shipped scenario."""
-    made = run(name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S})
-    return balance(made, left_null_vector(made.scenario))
+    """Returns the balance of a shipped scenario."""
+    trajectory_of_run = run(
+        name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
+    )
+    return balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))
 
 
 def order(name: str, scheme: str, rate_hz: int) -> float:
-    """Of the balance's error from half of a rate to that rate."""
+    """Returns the order of the balance's error from half of a rate to that rate."""
     return float(
         np.log2(
             booked(name, scheme, rate_hz // 2).residual / booked(name, scheme, rate_hz).residual

@@ -1,4 +1,4 @@
-"""Virtual runs measured by the windows of `[expect]`, and how close a figure must come.
+"""Virtual runs measured by the windows of `[expect]`, and the required closeness of figures.
 
 The figures that tests here cite were made with another implementation of the same equations.
 """
@@ -17,8 +17,10 @@ Overrides = dict[str, Any]
 def measured(
     name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]
 ) -> RunMetrics:
-    """A shipped scenario, changed, in virtual time; its windows are (from, to, site), "" for all sites."""
-    asked = [
+    """Returns a shipped scenario, changed, in virtual time; its windows are (from, to, site),
+    "" for all sites.
+    """
+    windows_of_run = [
         {
             "from_s": from_s,
             "to_s": to_s,
@@ -28,20 +30,20 @@ def measured(
         for from_s, to_s, site in windows
     ]
     return measure_virtual_run(
-        load_scenario(name, {**(overrides or {}), "expect": {"windows": asked}})
+        load_scenario(name, {**(overrides or {}), "expect": {"windows": windows_of_run}})
     )
 
 
 def peak(figures: RunMetrics, n: int = 0) -> float:
-    """Largest |e| of a window."""
+    """Returns the largest |e| of a window."""
     return figures.windows[n]["error_peak_rad"].most
 
 
 def value(figures: RunMetrics, key: str, n: int = 0) -> float:
-    """A quantity of a window that has one value."""
+    """Returns a quantity of a window that has one value."""
     return figures.windows[n][key].most
 
 
-def printed(figure: float, digit: float) -> Any:
-    """What equals a figure within its last printed digit or 2 %, whichever is larger."""
+def approximate_figure(figure: float, digit: float) -> Any:
+    """Returns an approximation within the last printed digit or 2 %, whichever is larger."""
     return pytest.approx(figure, abs=max(digit, 0.02 * abs(figure)))

@@ -18,19 +18,19 @@ RODS = {"arm.lc1_m": 0.5, "arm.lc2_m": 0.5, "arm.I1_kg_m2": 1 / 12, "arm.I2_kg_m
 
 
 def loop(A: Any, *delayed: tuple[float, Any]) -> LinearLoop:
-    """x' = A x + sum A_k x(t - T_k), with nobody at it."""
-    own = np.atleast_2d(np.asarray(A, dtype=float))
-    n = len(own)
+    """Returns x' = A x + sum A_k x(t - T_k), without operators."""
+    matrix = np.atleast_2d(np.asarray(A, dtype=float))
+    n = len(matrix)
     entries = [
         DelayedTerm(T, np.atleast_2d(np.asarray(Ad, dtype=float)), np.zeros((n, 0)))
         for T, Ad in delayed
     ]
     names = tuple(f"x.q{i}" for i in range(n))
-    return LinearLoop(names, (), (), own, np.zeros((n, 0)), np.zeros((0, n)), tuple(entries))
+    return LinearLoop(names, (), (), matrix, np.zeros((n, 0)), np.zeros((0, n)), tuple(entries))
 
 
 def residual(system: LinearLoop, s: complex) -> float:
-    """The smallest singular value of Delta(s) over the size of its terms, from the definition."""
+    """Returns the smallest singular value of Delta(s) over the size of its terms, from the definition."""
     delta = s * np.eye(len(system.A)) - system.A
     size = abs(s) + np.linalg.norm(system.A)
     for delayed in system.delayed:
@@ -40,7 +40,7 @@ def residual(system: LinearLoop, s: complex) -> float:
 
 
 def roots_within(system: LinearLoop, low: complex, high: complex, points: int = 4000) -> int:
-    """How many roots a rectangle has: by how often det Delta turns about 0 along its sides."""
+    """Counts the roots in a rectangle by the turns of det Delta about 0 along its sides."""
     corners = [low, complex(high.real, low.imag), high, complex(low.real, high.imag), low]
     path = np.concatenate(
         [
@@ -74,7 +74,7 @@ GAINS = {
 
 
 def site(rng: np.random.Generator, law: str, actors: Sequence[TorqueSource] = ()) -> SiteSetup:
-    """A site with a random physical arm and random gains."""
+    """Draws a site with a random physical arm and random gains."""
     l1, m1, l2, m2 = rng.uniform(0.5, 2, 4)
     links = ArmLinks(l1, m1, 0.6 * l1, m1 * l1**2 / 12, l2, m2, 0.4 * l2, m2 * l2**2 / 12)
     return SiteSetup(
@@ -95,7 +95,9 @@ def site(rng: np.random.Generator, law: str, actors: Sequence[TorqueSource] = ()
 
 
 def actors(rng: np.random.Generator) -> list[TorqueSource]:
-    """One of each kind that depends on the arm: hands, an environment, and a wall that is touched or not."""
+    """Draws one of each kind that depends on the arm: hands, an environment, and a wall that is
+    touched or not.
+    """
     turn = rng.uniform(0, 2 * np.pi)
     pairs = [tuple(rng.uniform(0.5, 20, 2)) for _ in range(8)]
     wall = {

@@ -14,7 +14,9 @@ Complex = NDArray[np.complex128]
 
 
 class Wire(NamedTuple):
-    """A torque on `at` towards where `of` was, by K and B after a delay; and a share of what pushed `of`."""
+    """A torque on `at` towards the earlier position of `of`, by K and B after a delay; and a
+    share of the torque on `of`.
+    """
 
     at: int
     of: int
@@ -65,7 +67,7 @@ class Network(NamedTuple):
         )
 
     def impedance(self, w_rad_s: Sequence[float] | Array) -> Complex:
-        """Z with Z qd = (1 + reflection) u, from the equations of motion as they stand on paper."""
+        """Returns Z with Z qd = (1 + reflection) u, from the equations of motion as written on paper."""
         s = 1j * np.asarray(w_rad_s)
         Z = np.zeros((len(s), len(self.m), len(self.m)), np.complex128)
         reflected = np.zeros_like(Z) + np.eye(len(self.m))
@@ -80,7 +82,9 @@ class Network(NamedTuple):
 
 
 def hold_by_spring(loop: LinearLoop, site: str, K: float, B: float = 0.0) -> LinearLoop:
-    """The loop with a spring, N m/rad, and a damper, N m s/rad, to a fixed point at each joint of a site."""
+    """Returns the loop with a spring, N m/rad, and a damper, N m s/rad, to a fixed point at
+    each joint of a site.
+    """
     ports = find_site_ports(loop, site)
     back = np.zeros((len(loop.inputs), len(loop.names)))
     back[ports] = B * loop.C[ports]
@@ -97,6 +101,6 @@ def pair(
     T: tuple[float, float] = (0.2, 0.2),
     B: float = 0.0,
 ) -> Network:
-    """Two sites that follow each other: P+d with B = 0."""
+    """Returns two sites that follow each other: P+d with B = 0."""
     wires = (Wire(0, 1, K[0], B, T[0]), Wire(1, 0, K[1], B, T[1]))
     return Network((1.0, 1.5), d, (0.0, 0.0), wires)

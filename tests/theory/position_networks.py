@@ -22,7 +22,9 @@ def position_network(
     masses: Sequence[float] | None = None,
     **changes: Any,
 ) -> Scenario:
-    """Uniform rods of such masses, kg (1 m long, two to an arm), all from one pose, under P+d."""
+    """Returns uniform rods of the given masses, kg (1 m long, two to an arm), all from one
+    pose, under P+d.
+    """
     count = len(alpha)
     names = [f"s{n}" for n in range(count)]
     lines = [
@@ -55,7 +57,7 @@ def position_network(
 
 
 def rods(mass_kg: float, q2_rad: float) -> Array:
-    """M of two uniform rods of 1 m, kg m^2."""
+    """Returns M of two uniform rods of 1 m, kg m^2."""
     c = np.cos(q2_rad)
     return mass_kg * np.array([[5 / 3 + c, 1 / 3 + c / 2], [1 / 3 + c / 2, 1 / 3]])
 

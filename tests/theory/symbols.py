@@ -10,7 +10,7 @@ Q, QD = sp.Matrix(sp.symbols("q1:3", real=True)), sp.Matrix(sp.symbols("qd1:3", 
 
 
 def diagonal(name: str) -> sp.Matrix:
-    """A diagonal gain."""
+    """Returns a diagonal gain."""
     return sp.diag(*sp.symbols(f"{name}1:3", positive=True))
 
 
@@ -27,7 +27,7 @@ def dot(a: sp.Matrix, b: sp.Matrix) -> Any:
 
 
 def plain(expression: Any) -> Any:
-    """The one form of a polynomial in sines and cosines of q1 and q2."""
+    """Returns the normal form of a polynomial in sines and cosines of q1 and q2."""
     angles = {sp.sin(x): sp.Symbol(f"sin_{x}") for x in Q}
     written = sp.expand(sp.expand_trig(expression)).subs(angles)
     for x, sine in zip(Q, angles.values(), strict=True):
@@ -44,13 +44,13 @@ def zero(expression: Any) -> bool:
 
 
 def inertia() -> sp.Matrix:
-    """M of Section IV in theta."""
+    """Returns M of Section IV in theta."""
     m12 = THETA[2] + THETA[1] * sp.cos(Q[1])
     return sp.Matrix([[THETA[0] + 2 * THETA[1] * sp.cos(Q[1]), m12], [m12, THETA[2]]])
 
 
 def coriolis(qd: sp.Matrix) -> sp.Matrix:
-    """C of Section IV in theta."""
+    """Returns C of Section IV in theta."""
     h = -THETA[1] * sp.sin(Q[1])
     return sp.Matrix([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0]])
 
@@ -61,10 +61,10 @@ def gravity() -> sp.Matrix:
 
 
 def forces(v: sp.Matrix, a: sp.Matrix) -> sp.Matrix:
-    """M a + C(q, qd) v + G: what Y theta of Eq. (12) has to be."""
+    """Returns M a + C(q, qd) v + G, which Y theta of Eq. (12) has to equal."""
     return inertia() * a + coriolis(QD) * v + gravity()
 
 
 def columns(v: sp.Matrix, a: sp.Matrix) -> sp.Matrix:
-    """Y(q, qd, v, a), found as the derivative of that by theta."""
+    """Returns Y(q, qd, v, a), found as the derivative of these forces by theta."""
     return forces(v, a).jacobian(THETA)

@@ -22,13 +22,15 @@ PERIOD_S = 1e-3
 
 
 def angles(records: np.ndarray) -> np.ndarray:
-    """q1 and q1 + q2 of the slave in the last of some records."""
+    """Returns q1 and q1 + q2 of the slave in the last of some records."""
     q = records[2, -1, :2]
     return np.array([q[0], q.sum()])
 
 
 def predicted(name: str, delay_s: float) -> np.ndarray:
-    """sin q1 and sin (q1 + q2) in the end, from level arms and estimates of zero, with Gamma = Lambda = 1."""
+    """Returns sin q1 and sin (q1 + q2) in the end, from level arms and estimates of zero, with
+    Gamma = Lambda = 1.
+    """
     return -theta_of(load_scenario(name).sites["s"].arm)[3:] / (G * (1.0 + delay_s))
 
 
@@ -46,8 +48,8 @@ def test_the_final_pose_follows_from_the_first_estimates(
     name: str, delay_s: float, end_s: float, bar: dict[str, float]
 ) -> None:
     """The least delay is one period."""
-    made = sampled(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
-    assert np.sin(angles(made)) == pytest.approx(predicted(name, max(delay_s, PERIOD_S)), **bar)
+    end = sampled(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
+    assert np.sin(angles(end)) == pytest.approx(predicted(name, max(delay_s, PERIOD_S)), **bar)
 
 
 def test_gravity_alone_is_learnt() -> None:
@@ -57,10 +59,12 @@ def test_gravity_alone_is_learnt() -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("paper_rods", marks=pytest.mark.long)])
-def test_what_the_derivation_integrates_is_conserved(name: str) -> None:
-    """theta_hat_4 + Gamma g (sin q1 + int cos(q1) Lambda e1 dt), whatever the hands do; so with q1 + q2."""
-    made = run(name, {"duration_s": 20.0})
-    for site in made.sites.values():
+def test_the_derivations_integral_is_conserved(name: str) -> None:
+    """theta_hat_4 + Gamma g (sin q1 + int cos(q1) Lambda e1 dt), whatever the hands do; the
+    same with q1 + q2.
+    """
+    trajectory_of_run = run(name, {"duration_s": 20.0})
+    for site in trajectory_of_run.sites.values():
         e = site.q - site.q_des
         turned = np.stack([site.q[:, 0], site.q.sum(axis=1)], axis=1)
         power = G * np.cos(turned) * np.stack([e[:, 0], e.sum(axis=1)], axis=1)
@@ -70,8 +74,10 @@ def test_what_the_derivation_integrates_is_conserved(name: str) -> None:
         assert np.abs(kept - kept[0]).max() < 1e-4
 
 
-def test_hand_sees_spring_of_115_nm_per_rad_and_arm() -> None:
-    """Gamma g^2 cos^2 (1 + Lambda T), 115.5 N m/rad level; a push at one site moves all three by a third."""
+def test_hands_see_115_nm_per_rad() -> None:
+    """Gamma g^2 cos^2 (1 + Lambda T), 115.5 N m/rad level; a push at one site moves all three
+    by a third.
+    """
     push_nm = 15.0
     hands = [
         {"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}
@@ -80,19 +86,19 @@ def test_hand_sees_spring_of_115_nm_per_rad_and_arm() -> None:
     pushed = sampled(
         load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,)
     )
-    there, from_where = angles(pushed), angles(rest)
+    pushed_angles, from_where = angles(pushed), angles(rest)
     # equal torques act on q1 + q2 alone
-    assert there[0] == pytest.approx(from_where[0], abs=2e-3)
+    assert pushed_angles[0] == pytest.approx(from_where[0], abs=2e-3)
     # no error: nothing is felt
     assert np.abs(pushed[:, -1, :2] - pushed[:, -1, 4:6]).max() < 1e-4
-    middle = 0.5 * (there[1] + from_where[1])
-    stiffness = push_nm / 3.0 / (there[1] - from_where[1])
+    middle = 0.5 * (pushed_angles[1] + from_where[1])
+    stiffness = push_nm / 3.0 / (pushed_angles[1] - from_where[1])
     level = G**2 * 1.2
     assert level == pytest.approx(115.5, abs=0.1)
     assert stiffness == pytest.approx(level * np.cos(middle) ** 2, rel=0.01)
 
 
-def test_small_gain_has_no_such_pose_and_arms_hang() -> None:
+def test_small_gains_let_arms_hang() -> None:
     """Gamma = 0.1: |sin q1(inf)| would have to be 1.7."""
     hanging = load_scenario("paper", {"control.Gamma": 0.1}).without_hands()
     assert predicted("paper", 0.2)[0] / 0.1 < -1.0
@@ -107,11 +113,11 @@ HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
 
 
 @pytest.mark.long
-def test_hand_feels_load_times_beta_of_slave_over_its_own() -> None:
+def test_hands_feel_loads_by_ratios_of_beta() -> None:
     """Of 5 N m on the slave: 4.79 at the expert, 16.4 at the trainee, 5.00 with all shares 1/2; 2 %."""
     b1, b2, bs = left_null_vector(load_scenario("force_sharing"))
-    made = measured("force_sharing", {}, *HELD)
-    felt = [-value(made, "push1_mean_nm", n) for n in range(len(HELD))]
+    windows = measured("force_sharing", {}, *HELD)
+    felt = [-value(windows, "push1_mean_nm", n) for n in range(len(HELD))]
     assert felt == pytest.approx([4.79, 16.4, 5.00], rel=0.02)
     assert felt == pytest.approx([LOAD_NM * bs / b1, LOAD_NM * bs / b2, LOAD_NM], rel=0.02)
     assert felt[::2] == pytest.approx([LOAD_NM * bs / b1, LOAD_NM], rel=1e-3)  # both at rest

@@ -16,9 +16,9 @@ LONG_TIMES_S = np.arange(0.05, 10.01, 0.05)
 
 
 def motion(rate_hz: int, times_s: Array) -> Array:
-    """q of the tick at each of these times, shape (3, K, 6)."""
-    made = sampled(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
-    return made[..., :6]
+    """Returns q of the tick at each of these times, shape (3, K, 6)."""
+    motion_at_times = sampled(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
+    return motion_at_times[..., :6]
 
 
 @pytest.mark.long
@@ -32,7 +32,7 @@ def test_second_order_follows_the_stored_motion() -> None:
 
 
 @pytest.mark.long
-def test_second_order_of_chains_has_order_two_over_ten_seconds() -> None:
+def test_chains_keep_order_two_over_ten_seconds() -> None:
     pytest.importorskip(
         "pinocchio", reason="requirements/robots.lock is not installed: make test-long"
     )

@@ -1,6 +1,6 @@
-"""Threads of the linear algebra: as they were, and no number changed.
+"""Threads of the linear algebra library are restored, and no number changes.
 
-Roots against closed forms, and against the number of turns of det Delta, which misses none.
+Roots against closed forms, and against the number of turns of det Delta, which misses no root.
 """
 
 import math
@@ -22,11 +22,11 @@ from trilat_net.analysis.theory.characteristic_roots import (
 )
 
 
-def test_the_number_of_threads_is_put_back_whatever_happens() -> None:
-    found = characteristic_roots._find_blas_functions()
-    if found is None:
+def test_the_number_of_threads_is_restored() -> None:
+    blas_functions = characteristic_roots._find_blas_functions()
+    if blas_functions is None:
         pytest.skip("this NumPy has no OpenBLAS that can be asked")
-    get, _ = found
+    get, _ = blas_functions
     before = get()
     with limit_blas_threads():
         assert get() == 1
@@ -36,14 +36,14 @@ def test_the_number_of_threads_is_put_back_whatever_happens() -> None:
     assert get() == before
 
 
-def test_where_nobody_can_be_asked_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_thread_control_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(characteristic_roots, "_find_blas_functions", lambda: None)
     with limit_blas_threads():
         assert np.linalg.eigvals(np.eye(2)).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("E", [None, np.array([1.0, 0.0])])
-def test_a_guess_beyond_the_range_of_exp_is_dropped(E: np.ndarray | None) -> None:
+def test_guesses_beyond_exps_range_are_dropped(E: np.ndarray | None) -> None:
     """exp(-s T) of a root far to the left is no number; the root near -1 /s is found all the same."""
     A, late = np.array([[-1.0, 0.0], [1.0, -2.0]]), np.array([[[0.0, 0.0], [1e-3, 0.0]]])
     pencil = characteristic_roots.Pencil(A, np.array([0.5]), late, E)
@@ -56,17 +56,17 @@ def test_a_guess_beyond_the_range_of_exp_is_dropped(E: np.ndarray | None) -> Non
 
 
 @given(a=st.floats(-3, 3).filter(lambda a: abs(a) > 0.05), T=st.floats(0.02, 3))
-def test_one_delay_is_lamberts_function(a: float, T: float) -> None:
+def test_one_delay_gives_lamberts_function(a: float, T: float) -> None:
     """x' = -a x(t - T) has the roots W_k(-a T) / T."""
-    found = compute_delay_spectrum(loop(0.0, (T, -a)), 3).roots
+    roots = compute_delay_spectrum(loop(0.0, (T, -a)), 3).roots
     exact = np.array([lambertw(-a * T, k) / T for k in range(-6, 7)])
     exact = exact[exact.imag >= -1e-9]
     exact = exact[np.argsort(-exact.real)]
-    assert len(found) == 3
+    assert len(roots) == 3
     # two roots meet: they are known to the root of rounding only
     if abs(a * T - 1 / math.e) < 1e-3:
         return
-    for root, wanted in zip(found, exact, strict=False):
+    for root, wanted in zip(roots, exact, strict=False):
         assert abs(root.s - wanted) <= 1e-9 * (1 + abs(wanted))
 
 
@@ -79,29 +79,29 @@ def test_the_textbook_case() -> None:
 @given(a=st.floats(0.1, 0.9))
 def test_two_delays_with_a_root_on_the_axis(a: float) -> None:
     """x' = -a x(t - pi/2) - (1 - a) x(t - 5 pi/2) has the root j, since both terms turn by a quarter."""
-    found = compute_delay_spectrum(loop(0.0, (math.pi / 2, -a), (5 * math.pi / 2, a - 1)), 8)
-    assert min(abs(root.s - 1j) for root in found.roots) <= 1e-9
+    spectrum = compute_delay_spectrum(loop(0.0, (math.pi / 2, -a), (5 * math.pi / 2, a - 1)), 8)
+    assert min(abs(root.s - 1j) for root in spectrum.roots) <= 1e-9
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=25)
 def test_no_root_is_missed(seed: int) -> None:
-    """As many as det Delta has zeros to the right of the last one that was asked for."""
+    """The count equals the zeros of det Delta to the right of the last requested root."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 5))
     delays = np.sort(rng.uniform(0.05, 1.5, 2))
     system = loop(
         rng.normal(size=(n, n)), *((float(T), rng.normal(size=(n, n))) for T in delays)
     )
-    found = compute_delay_spectrum(system, 5)
-    assert all(residual(system, root.s) <= 1e-12 for root in found.roots)
-    reals = [root.s.real for root in found.roots]
+    spectrum = compute_delay_spectrum(system, 5)
+    assert all(residual(system, root.s) <= 1e-12 for root in spectrum.roots)
+    reals = [root.s.real for root in spectrum.roots]
     assert reals == sorted(reals, reverse=True)
-    for after, before in zip(found.roots[1:], found.roots, strict=False):
+    for after, before in zip(spectrum.roots[1:], spectrum.roots, strict=False):
         gap = before.s.real - after.s.real
         if gap > 0.05:
             left = before.s.real - 0.5 * gap
-            right = [root for root in found.roots if root.s.real > left]
+            right = [root for root in spectrum.roots if root.s.real > left]
             count = sum(root.multiplicity * (2 if root.s.imag else 1) for root in right)
             far = sum(
                 np.linalg.norm(d.A) * math.exp(max(0.0, -left) * d.delay_s)
@@ -113,29 +113,29 @@ def test_no_root_is_missed(seed: int) -> None:
             )
 
 
-def test_several_modes_that_share_a_root_are_one_root() -> None:
+def test_several_modes_sharing_a_root_count_once() -> None:
     system = loop(-np.eye(3), (0.5, -2.0 * np.eye(3)))
     (root,) = compute_delay_spectrum(system, 1).roots
     assert root.multiplicity == 3
 
 
-def test_roots_at_zero_are_counted_and_never_the_rightmost() -> None:
+def test_roots_at_zero_are_never_the_rightmost() -> None:
     """Two masses that agree on any place, one estimate that nothing moves, and one that moves nothing."""
     A = np.zeros((4, 4))
     A[0, 0] = A[1, 1] = -1.0
     A[3, 0] = 1.0
     late = np.zeros((4, 4))
     late[0, 1] = late[1, 0] = 1.0
-    found = compute_delay_spectrum(loop(A, (0.3, late)), 3)
-    assert (found.zeros, found.drifting) == (3, 0)
-    assert found.rightmost is not None
-    assert found.rightmost.s.real < -0.1
-    assert found.verdict == "stable"
+    spectrum = compute_delay_spectrum(loop(A, (0.3, late)), 3)
+    assert (spectrum.zeros, spectrum.drifting) == (3, 0)
+    assert spectrum.rightmost is not None
+    assert spectrum.rightmost.s.real < -0.1
+    assert spectrum.verdict == "stable"
 
 
-def test_a_mass_that_nothing_holds_drifts() -> None:
-    found = compute_delay_spectrum(loop([[0.0, 1.0], [0.0, 0.0]]), 1)
-    assert (found.zeros, found.roots) == (2, ())
+def test_an_unheld_mass_drifts() -> None:
+    spectrum = compute_delay_spectrum(loop([[0.0, 1.0], [0.0, 0.0]]), 1)
+    assert (spectrum.zeros, spectrum.roots) == (2, ())
     chain = np.zeros((3, 3))
     chain[0, 1] = chain[2, 0] = 1.0
     chain[2, 2] = -1.0

@@ -1,4 +1,4 @@
-"""Errata 13: how much damping P+d needs for N sites, against roots that are counted independently."""
+"""Errata 13: the damping that P+d needs for N sites, against roots that are counted independently."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -32,18 +32,18 @@ MANY_TICKS = 20
 
 
 def equal(count: int) -> Any:
-    """Equal shares."""
+    """Returns equal shares."""
     return (np.ones((count, count)) - np.eye(count)) / (count - 1)
 
 
 def shares(rng: np.random.Generator, count: int, *, reversible: bool) -> Any:
-    """Random shares; reversible ones from weights that are the same both ways."""
+    """Returns random shares; reversible ones from weights that are the same both ways."""
     weights = rng.uniform(0.0, 1.0, (count, count)) ** 2 * (1.0 - np.eye(count))
     weights = weights + weights.T if reversible else weights
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def test_what_is_balanced_is_reversible() -> None:
+def test_balanced_shares_are_reversible() -> None:
     """Kolmogorov's criterion for three sites, and weights that make D alpha symmetric for any number."""
     rng = np.random.default_rng(1)
     for count in (2, 3, 5, 8):
@@ -62,7 +62,7 @@ def test_what_is_balanced_is_reversible() -> None:
     assert find_balancing_weights(follower) is not None
 
 
-def test_the_common_motion_asks_for_its_share_at_one_mass() -> None:
+def test_common_motion_determines_the_worst_mass() -> None:
     """-min sin x / x is at tan x = x; there m w^2 = K (1 - cos x): m = 1.2172 K T^2 / 20.19."""
     x = float(sp.nsolve(sp.tan(sp.Symbol("x")) - sp.Symbol("x"), 4.5))
     assert pytest.approx(-np.sin(x) / x, abs=1e-10) == COMMON_MOTION_SHARE
@@ -84,15 +84,15 @@ def test_irreversible_shares_have_no_bound(
     scenario = position_network(alpha, d=d, delay_ms=delay_ms, masses=masses)
     assert d > 10.0 * delay_ms / 1e3 * abs(np.linalg.eigvals(alpha).real.min()) * (1.0 + 1e-9)
     assert evaluate_criterion(scenario) is None
-    found = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
-    assert found is not None
-    assert found.s.real == pytest.approx(growth_per_s, abs=1e-3)
+    rightmost = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
+    assert rightmost is not None
+    assert rightmost.s.real == pytest.approx(growth_per_s, abs=1e-3)
     assert (
         count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
     )
 
 
-def test_seven_equal_shares_ask_more_than_their_least_eigenvalue() -> None:
+def test_seven_equal_shares_exceed_their_eigenvalue() -> None:
     """K T = 2, d = 0.36: 1/6 of it is 0.333, 0.2172 of it 0.434."""
     lacking, enough = (
         evaluate_criterion(position_network(equal(7), d=d)) for d in (0.36, 0.44)
@@ -106,7 +106,8 @@ def test_seven_equal_shares_ask_more_than_their_least_eigenvalue() -> None:
 
 
 def check_sharpness(alpha: Any, K: float, ticks: int) -> None:
-    """Asserts that some mass grows with 2 % less than the criterion asks, and does not with 2 % more.
+    """Asserts that some mass grows with 2 % less than the criterion asks, and does not with 2 %
+    more.
 
     Heavy arms where abs(lambda_min) is 0.2172 and more, m = 1.2172 K T^2 / 20.19 below.
     """
@@ -128,14 +129,14 @@ def check_sharpness(alpha: Any, K: float, ticks: int) -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 8])
 @pytest.mark.parametrize("seed", range(8))
-def test_it_is_the_edge_itself_at_the_worst_mass(count: int, seed: int) -> None:
+def test_the_bound_is_the_worst_masss_edge(count: int, seed: int) -> None:
     rng = np.random.default_rng(100 * count + seed)
     alpha = shares(rng, count, reversible=True) if seed else equal(count)
     check_sharpness(alpha, rng.uniform(2.0, 50.0), int(rng.integers(20, 800)))
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 3])
-def test_of_few_ticks_it_is_edge_of_loop_as_computed(ticks: int) -> None:
+def test_few_ticks_give_the_computed_edge(ticks: int) -> None:
     """Errata 13: 0.667 K h for one tick, and any masses above d h."""
     criterion = evaluate_criterion(position_network(equal(3), d=0.0, delay_ms=float(ticks)))
     assert criterion is not None
@@ -152,7 +153,7 @@ def test_of_few_ticks_it_is_edge_of_loop_as_computed(ticks: int) -> None:
 
 
 def pair_with_error_damping(d: Any, Kd: Any, masses: Any, K: Any = (10.0, 10.0)) -> Any:
-    """The rightmost root of two sites under PD+d, 200 ms apart."""
+    """Returns the rightmost root of two sites under PD+d, 200 ms apart."""
     wires = (Wire(0, 1, K[0], Kd[0], 0.2), Wire(1, 0, K[1], Kd[1], 0.2))
     spectrum = compute_delay_spectrum(
         Network(tuple(masses), tuple(d), (0.0, 0.0), wires).loop, 1
@@ -172,16 +173,18 @@ def test_pd_d_of_one_ratio_keeps_the_bound() -> None:
         assert root is None or root.s.real < 1e-9
 
 
-def test_pd_d_of_another_ratio_grows_above_the_bound() -> None:
+def test_pd_d_of_other_ratios_grows_above() -> None:
     assert 4.0 * 11.8 * 0.356 > (2.0 * 0.2 * 10.0) ** 2
     root = pair_with_error_damping((11.8, 0.356), (307.0, 0.0), (0.58, 0.17))
     assert root.s.real == pytest.approx(0.55, abs=0.01)
 
 
 def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
-    """Asserts that a random network with damping to spare has no growing root; returns if it had some.
+    """Asserts that a random network with damping to spare has no growing root; returns whether
+    it had some.
 
-    None where the criterion does not speak. If asked for, it asserts that the criterion is sharp, too.
+    None if the criterion does not apply. On request it also asserts that the criterion is
+    sharp.
     """
     count = int(rng.integers(2, 9))
     alpha = shares(rng, count, reversible=bool(rng.integers(2)))
@@ -215,20 +218,20 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
     ("seed", "sharp"),
     [(0, False), *(pytest.param(n, True, marks=pytest.mark.long) for n in range(8))],
 )
-def test_it_never_calls_enough_what_grows(seed: int, *, sharp: bool) -> None:
+def test_the_bound_never_accepts_growth(seed: int, *, sharp: bool) -> None:
     """250 networks a seed: 2 to 8 sites, any shares, masses over a decade, delays to 1 s."""
     rng = np.random.default_rng(seed)
-    found = [check_network(rng, sharp=sharp) for _ in range(250)]
-    assert found.count(True) > 40
-    assert found.count(False) > 40
-    assert found.count(None) > 40
+    outcomes = [check_network(rng, sharp=sharp) for _ in range(250)]
+    assert outcomes.count(True) > 40
+    assert outcomes.count(False) > 40
+    assert outcomes.count(None) > 40
 
 
 K_PAIR, TICK_S = 50.0, 1.0 / 30.0
 
 
 def judged(count: int, ticks: int, d: float) -> StabilityCondition:
-    """The condition of equal sites at 30 Hz whose torques are held."""
+    """Returns the condition of equal sites at 30 Hz whose torques are held."""
     laws = (SimpleNamespace(K=(K_PAIR,), d=(d,)),) * count
     names, delay_s = tuple(map(str, range(count))), ticks * TICK_S * (equal(count) > 0.0)
     situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=TICK_S)
@@ -236,7 +239,9 @@ def judged(count: int, ticks: int, d: float) -> StabilityCondition:
 
 
 def growth(count: int, ticks: int, d: float, mass: float) -> float:
-    """The rate, 1/s, of the loop from tick to tick, mode by mode of equal shares: x, its speed, x before."""
+    """Returns the rate, 1/s, of the loop from tick to tick, mode by mode of equal shares: x,
+    its speed, x before.
+    """
     rates = []
     for share in (1.0, -1.0 / (count - 1)):
         row = np.zeros(2 + ticks)
@@ -251,8 +256,8 @@ def growth(count: int, ticks: int, d: float, mass: float) -> float:
     return float(max(rates))
 
 
-def test_held_torques_ask_for_more_than_bound_of_continuous_time() -> None:
-    """K 50, d 2 at 30 Hz over a tick: 1.667 would do in continuous time."""
+def test_held_torques_need_more_than_continuous_time() -> None:
+    """K 50, d 2 at 30 Hz over a tick: 1.667 would suffice in continuous time."""
     assert judged(2, 1, 3.33).holds is False
     assert judged(2, 1, 3.34).holds
     assert growth(2, 1, 2.0, 1.0) == pytest.approx(0.595, abs=5e-3)
@@ -261,7 +266,7 @@ def test_held_torques_ask_for_more_than_bound_of_continuous_time() -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 5, 7])
 @pytest.mark.parametrize("ticks", [1, 2, 3, 20])
-def test_bound_of_held_torques_is_that_of_worst_mass(count: int, ticks: int) -> None:
+def test_held_torques_bound_the_worst_mass(count: int, ticks: int) -> None:
     """Above it no arm heavier than d h / 2 grows; 3 % below it some arm does."""
     text = judged(count, ticks, 1e3).text
     sides = (
@@ -277,11 +282,11 @@ def test_bound_of_held_torques_is_that_of_worst_mass(count: int, ticks: int) -> 
 
 
 def slopes_of_tanh(poses: Any, K: float, P: float) -> Any:
-    """The slopes of P tanh(K e / P) between sites that are held at some poses."""
+    """Returns the slopes of P tanh(K e / P) between sites that are held at some poses."""
     return K / np.cosh(K * (poses[:, None] - poses) / P) ** 2
 
 
-def test_slopes_of_tanh_obey_the_bound_of_p_d() -> None:
+def test_slopes_of_tanh_obey_p_d_bounds() -> None:
     """Errata 13: positive semidefinite, and by Schur's theorem lambda_min K <= S o kappa <= K."""
     rng = np.random.default_rng(13)
     for count in (2, 3, 4, 6):
@@ -299,14 +304,14 @@ def test_slopes_of_tanh_obey_the_bound_of_p_d() -> None:
 
 
 def sloped(slopes: Any, d: float) -> Network:
-    """Three heavy sites of equal shares, whose pulls have these slopes; T = 100 ms."""
+    """Returns three heavy sites of equal shares, whose pulls have these slopes; T = 100 ms."""
     wires = tuple(
         Wire(i, j, 0.5 * slopes[i][j], 0.0, 0.1) for i in range(3) for j in range(3) if i != j
     )
     return Network((5.0,) * 3, (d,) * 3, (0.0,) * 3, wires)
 
 
-def test_slopes_up_to_k_alone_are_not_enough() -> None:
+def test_slopes_up_to_k_do_not_suffice() -> None:
     """Errata 13: d = 0.6 K T is above 0.5 K T; (K, K, 0) grows, and slopes that tanh can have do not."""
     K = 10.0
     chain = K * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])

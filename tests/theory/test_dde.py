@@ -1,6 +1,6 @@
 """Virtual runs against the delay-differential equations, solved by another method.
 
-Eq. (6), (8)-(10), (13), (15) in continuous time; what is sampled must converge to them.
+Eq. (6), (8)-(10), (13), (15) in continuous time, to which the sampled runs must converge.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from trilat_net.scenario import load_scenario
 
 
 @pytest.mark.long
-def test_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
+def test_reference_solution_has_digits_to_spare() -> None:
     """The hands-free start of Section IV: with theta_hat(0) = 0 both joints fall with (-g, +g)."""
     paper = exact("paper")
     first = paper.rate(0.0, paper.past(-1.0).ravel()).reshape(3, 9)
@@ -33,12 +33,14 @@ def test_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
         ),
     ],
 )
-def test_second_order_is_within_1e_5_rad_of_exact_solution(name: str, bound: float) -> None:
+def test_second_order_is_within_1e_5_rad(name: str, bound: float) -> None:
     assert distance(name, "second_order", 1000) <= bound
 
 
-def test_this_comparison_shows_a_delay_one_tick_off() -> None:
-    """It moves q by some 5e-4 rad, below what `digital` is off: the bookkeeping has tests of its own."""
+def test_the_comparison_detects_delays_one_tick_off() -> None:
+    """One tick moves q by some 5e-4 rad, less than the error of `digital`: the delays have
+    tests of their own.
+    """
     early, right, late = (
         sampled(load_scenario("paper", {"link.delay_ms": delay_ms}), TIMES_S)[..., :2]
         for delay_ms in (199.0, 200.0, 201.0)

@@ -22,7 +22,7 @@ from trilat_net.scenario import load_scenario
 
 @given(a=st.floats(0.2, 5.0))
 @settings(max_examples=25)
-def test_a_delayed_integrator_bears_a_quarter_turn(a: float) -> None:
+def test_a_delayed_integrator_tolerates_a_quarter_turn(a: float) -> None:
     """x' = -a x(t - T): stable up to a T = pi/2, crossing at a."""
     (span,) = find_delay_margin(loop(0.0, (1.0, -a))).intervals
     assert (span.low_s, span.low) == (0.0, None)
@@ -31,23 +31,23 @@ def test_a_delayed_integrator_bears_a_quarter_turn(a: float) -> None:
     assert span.high.omega_rad_s == pytest.approx(a, rel=1e-9)
 
 
-def test_what_damps_itself_enough_is_stable_for_every_delay() -> None:
+def test_sufficient_damping_is_stable_for_every_delay() -> None:
     """x' = -2 x + x(t - T)."""
-    found = find_delay_margin(loop(-2.0, (1.0, 1.0)))
-    assert found.description == "stable for every common delay up to 10 s"
+    margin = find_delay_margin(loop(-2.0, (1.0, 1.0)))
+    assert margin.description == "stable for every common delay up to 10 s"
     assert (
         find_delay_margin(loop(1.0, (1.0, 0.5))).description
         == "unstable for every common delay up to 10 s"
     )
 
 
-def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
+def test_oscillators_have_several_stable_delay_windows() -> None:
     """x'' + 0.1 x' + x = -0.4 x(t - T) with its windows; each end is a root on the axis."""
     system = loop([[0.0, 1.0], [-4.0, -0.1]], (1.0, [[0.0, 0.0], [-1.0, 0.0]]))
-    found = find_delay_margin(system)
-    assert len(found.intervals) > 1
-    assert found.intervals[0].low is None
-    for span in found.intervals:
+    margin = find_delay_margin(system)
+    assert len(margin.intervals) > 1
+    assert margin.intervals[0].low is None
+    for span in margin.intervals:
         inside = 0.5 * (span.low_s + span.high_s)
         assert compute_delay_spectrum(set_common_delay(system, inside), 1).verdict == "stable"
         if span.high is not None:
@@ -61,14 +61,14 @@ def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=15)
-def test_the_verdict_over_delay_is_that_of_the_roots(seed: int) -> None:
+def test_verdicts_over_delay_are_the_roots(seed: int) -> None:
     rng = np.random.default_rng(seed)
     system = loop(rng.normal(size=(3, 3)) - np.eye(3), (1.0, 0.7 * rng.normal(size=(3, 3))))
-    found = find_delay_margin(system)
-    ends = [end for span in found.intervals for end in (span.low_s, span.high_s)]
+    margin = find_delay_margin(system)
+    ends = [end for span in margin.intervals for end in (span.low_s, span.high_s)]
     for T in (0.0, 0.1, 0.4, 1.0, 2.5):
         if all(abs(T - end) > 0.01 for end in ends if 0 < end < MAX_COMMON_DELAY_S):
-            inside = any(span.low_s <= T <= span.high_s for span in found.intervals)
+            inside = any(span.low_s <= T <= span.high_s for span in margin.intervals)
             assert (
                 compute_delay_spectrum(set_common_delay(system, T), 1).verdict == "stable"
             ) == inside
@@ -76,20 +76,20 @@ def test_the_verdict_over_delay_is_that_of_the_roots(seed: int) -> None:
 
 def test_roots_at_zero_cross_nothing() -> None:
     scenario = load_scenario("free")
-    found = find_delay_margin(
+    margin = find_delay_margin(
         linearise_loop(
             derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.1236, 0.3373))
         )
     )
-    assert found.description == "stable for every common delay up to 10 s"
+    assert margin.description == "stable for every common delay up to 10 s"
 
 
-def test_force_reflection_in_contact_has_margin_between_calm_and_hammering() -> None:
+def test_force_reflection_in_contact_has_a_margin() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
-    found = find_delay_margin(
+    margin = find_delay_margin(
         linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario))
     )
-    (span,) = found.intervals
+    (span,) = margin.intervals
     assert 0.02 < span.high_s < 0.2
-    assert "crosses at" in found.description
+    assert "crosses at" in margin.description

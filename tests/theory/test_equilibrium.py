@@ -1,4 +1,4 @@
-"""Where loops rest: equilibria of the equations, found from runs that settle, swing, or diverge."""
+"""The rests of loops: equilibria of the equations, found from runs that settle, swing, or diverge."""
 
 import numpy as np
 import pytest
@@ -22,34 +22,34 @@ TRIO = {"rate_hz": 200}
 )
 def test_a_rest_is_an_equilibrium(name: str) -> None:
     scenario = load_scenario(name, TRIO)
-    found = find_equilibrium(scenario)
+    equilibrium = find_equilibrium(scenario)
     assert np.abs(
-        compute_equilibrium_residual(derive_operating_conditions(scenario), found)
-    ).max() == pytest.approx(found.residual, abs=1e-14)
-    assert found.residual <= MAX_EQUILIBRIUM_RESIDUAL
+        compute_equilibrium_residual(derive_operating_conditions(scenario), equilibrium)
+    ).max() == pytest.approx(equilibrium.residual, abs=1e-14)
+    assert equilibrium.residual <= MAX_EQUILIBRIUM_RESIDUAL
 
 
-def test_a_run_that_settles_rests_where_it_ends() -> None:
+def test_a_settling_run_rests_where_it_ends() -> None:
     """The gravity anchor of the paper's experiment."""
-    found = find_equilibrium(load_scenario("paper", TRIO))
-    assert found.q == pytest.approx(np.tile([-0.1729, 0.0874], (3, 1)), abs=2e-3)
-    assert found.theta_hat[:, 3:] == pytest.approx(np.tile([2.0, 1.0], (3, 1)), abs=1e-6)
-    assert "the run is at rest" in found.how
+    equilibrium = find_equilibrium(load_scenario("paper", TRIO))
+    assert equilibrium.q == pytest.approx(np.tile([-0.1729, 0.0874], (3, 1)), abs=2e-3)
+    assert equilibrium.theta_hat[:, 3:] == pytest.approx(np.tile([2.0, 1.0], (3, 1)), abs=1e-6)
+    assert "the run is at rest" in equilibrium.how
 
 
 @pytest.mark.long
-def test_a_diverging_run_rests_where_its_linear_loop_goes() -> None:
-    """Equal gains: what is kept is the mean of the start poses."""
+def test_diverging_runs_rest_at_the_kept_mean() -> None:
+    """Equal gains: the mean of the start poses is conserved."""
     scenario = load_scenario("p_d_margin", {**TRIO, "control.d": 0.1, "link.delay_ms": 400.0})
-    found = find_equilibrium(scenario)
+    equilibrium = find_equilibrium(scenario)
     starts = np.mean([site.q0_rad for site in scenario.sites.values()], axis=0)
-    assert "the run diverges at" in found.how
-    assert found.q == pytest.approx(np.tile(starts, (3, 1)), abs=1e-9)
-    assert found.q == pytest.approx(predict_equilibrium(scenario).q)
+    assert "the run diverges at" in equilibrium.how
+    assert equilibrium.q == pytest.approx(np.tile(starts, (3, 1)), abs=1e-9)
+    assert equilibrium.q == pytest.approx(predict_equilibrium(scenario).q)
 
 
-def test_what_is_kept_weighs_sites_by_their_damping_and_delay() -> None:
-    """The pose that the linear loop foretells is that in which a run ends."""
+def test_the_kept_mean_weighs_damping_and_delay() -> None:
+    """The pose that the linear loop predicts is that in which a run ends."""
     scenario = load_scenario(
         "p_d_margin_two",
         {**TRIO, "sites.m.control.d": 9.0, "sites.s.control.d": 4.0, "duration_s": 60.0},
@@ -59,34 +59,34 @@ def test_what_is_kept_weighs_sites_by_their_damping_and_delay() -> None:
     )
 
 
-def test_a_run_that_hammers_has_an_equilibrium_in_contact() -> None:
+def test_hammering_runs_have_a_contact_equilibrium() -> None:
     scenario = load_scenario("contact", {**TRIO, "rate_hz": 500})
-    found = find_equilibrium(scenario)
-    assert "still moves" in found.how
+    equilibrium = find_equilibrium(scenario)
+    assert "still moves" in equilibrium.how
     now = derive_operating_conditions(scenario)
     # settles at the same pose
     calm = find_equilibrium(load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0}))
     assert "at rest" in calm.how
-    assert found.q == pytest.approx(calm.q, abs=1e-9)
+    assert equilibrium.q == pytest.approx(calm.q, abs=1e-9)
     assert np.abs(compute_equilibrium_residual(now, calm)).max() <= MAX_EQUILIBRIUM_RESIDUAL
 
 
-def test_a_pose_of_ones_own_is_taken_as_it_is() -> None:
+def test_a_users_pose_is_taken_unchanged() -> None:
     scenario = load_scenario("free")
-    found = find_equilibrium(scenario, (0.1, 0.3))
-    assert found.q.tolist() == [[0.1, 0.3]] * 3
-    assert found.theta_hat == pytest.approx(np.tile([3.0, 1.0, 1.0, 2.0, 1.0], (3, 1)))
-    assert found.notes == ()
+    equilibrium = find_equilibrium(scenario, (0.1, 0.3))
+    assert equilibrium.q.tolist() == [[0.1, 0.3]] * 3
+    assert equilibrium.theta_hat == pytest.approx(np.tile([3.0, 1.0, 1.0, 2.0, 1.0], (3, 1)))
+    assert equilibrium.notes == ()
 
 
-def test_pose_that_is_no_rest_is_said_to_be_none() -> None:
+def test_poses_out_of_rest_are_reported() -> None:
     (note,) = find_equilibrium(
         load_scenario("p_d_margin_two", {"control.gravity": 0.5}), (0.1, 0.3)
     ).notes
     assert "the pose is no equilibrium" in note
 
 
-def test_a_torque_beyond_the_clamp_is_said() -> None:
+def test_a_torque_beyond_the_clamp_is_reported() -> None:
     notes = find_equilibrium(
         load_scenario("free", {"limits.tau_limit_nm": 5.0}), (0.1, 0.3)
     ).notes
@@ -94,7 +94,7 @@ def test_a_torque_beyond_the_clamp_is_said() -> None:
     assert all("its clamp is 5" in note for note in notes)
 
 
-def test_a_rest_moves_along_with_a_key_that_moves_it() -> None:
+def test_rests_move_with_their_key() -> None:
     scenario = load_scenario("p_d_margin_two")
     rest = find_equilibrium(scenario, (0.3, 0.0))
     assert (
@@ -109,8 +109,8 @@ def test_a_rest_moves_along_with_a_key_that_moves_it() -> None:
     assert sagged.q[1, 0] < sagged.q[0, 0] < 0.3  # s hangs on m, which a hand holds
 
 
-def test_a_loop_that_rests_nowhere_is_refused() -> None:
-    """A torque that the arms cannot bear anywhere."""
+def test_a_loop_without_rest_is_refused() -> None:
+    """A torque that exceeds the arms' limits everywhere."""
     push = {"kind": "recorded", "points": [[0.0, 500.0, 0.0], [1000.0, 500.0, 0.0]]}
     scenario = load_scenario(
         "p_d_margin_two", {**TRIO, "sites.m.hands": [push], "duration_s": 2.0}
@@ -120,6 +120,6 @@ def test_a_loop_that_rests_nowhere_is_refused() -> None:
 
 
 @pytest.mark.parametrize("pose", [(float("nan"), 0.0), (float("inf"), 0.0)])
-def test_a_pose_that_is_none_is_refused(pose: tuple[float, float]) -> None:
+def test_an_invalid_pose_is_refused(pose: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="pose must be two angles"):
         find_equilibrium(load_scenario("free"), pose)

@@ -26,7 +26,7 @@ from tests.theory.symbols import (
 
 
 class Rates(NamedTuple):
-    """Site 1 with peers 2 and 3: V_1' by the chain rule, and what Eq. (16)-(19) are written with."""
+    """Site 1 with peers 2 and 3: V_1' by the chain rule, and the terms of Eq. (16)-(19)."""
 
     chain: Any
     r: sp.Matrix
@@ -43,7 +43,7 @@ class Rates(NamedTuple):
 
     @property
     def passed(self) -> Any:
-        """Sum over peers of alpha (|qd_j|^2 - |qd_j(t - T)|^2)."""
+        """Returns the sum over peers of alpha (|qd_j|^2 - |qd_j(t - T)|^2)."""
         terms = zip(self.alpha, self.qd_j, self.seen, strict=True)
         return sum(a * (norm(now, self.Kd) - norm(then, self.Kd)) for a, now, then in terms)
 
@@ -56,7 +56,10 @@ class Rates(NamedTuple):
 
 @cache
 def rates() -> Rates:
-    """Eq. (8), (13), (15) put into the derivative of Eq. (16), for delays T(t) that may grow."""
+    """Returns Eq.
+
+    (8), (13), (15) put into the derivative of Eq. (16), for delays T(t) that may grow.
+    """
     Lambda, Kp, Kd, Gamma = (
         diagonal("L"),
         diagonal("P"),
@@ -88,13 +91,13 @@ def rates() -> Rates:
 
 @cache
 def chain(constant: bool) -> Any:
-    """V_1' by the chain rule, with constant delays or not."""
+    """Returns V_1' by the chain rule, with constant delays or not."""
     x = rates()
     still = dict.fromkeys(x.growth, 0) if constant else {}
     return sp.expand(sp.expand_trig(x.chain.subs(still)))
 
 
-def test_eq_17_has_other_sign_and_half_of_last_term() -> None:
+def test_eq_17_has_wrong_sign_and_factor() -> None:
     """Errata 5, Eq. (17), and 9: the hands' power is r'tau_h, not qd'tau_h."""
     x = rates()
     right = -norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed / 2
@@ -127,7 +130,7 @@ def test_eq_19_does_not_follow_from_eq_17() -> None:
 # --- 8: delays that vary --------------------------------------------------------------------------------
 
 
-def test_a_delay_that_varies_adds_exactly_this() -> None:
+def test_varying_delay_adds_exactly_one_term() -> None:
     """Errata 8: sum_j alpha_ij T_ij' (1/2 |qd_jd|^2 + (Lambda Kd e + Lambda M r)'qd_jd)."""
     x = rates()
     push = x.Lambda * x.Kd * x.e + x.Lambda * inertia() * x.r
@@ -139,9 +142,11 @@ def test_a_delay_that_varies_adds_exactly_this() -> None:
 
 
 def one_joint(grows: float, Kp: float, Kd: float, Lambda: float, M: float) -> Any:
-    """V_i' less what beta cancels, as a symmetric matrix in (r, Lambda e, qd_jd), one joint, one peer.
+    """Returns V_i' without the terms that beta cancels, as a symmetric matrix in (r, Lambda e,
+    qd_jd), one joint, one peer.
 
-    From the chain rule above: -Kp r^2 - Kd/2 (qd - w)^2 + T' (Kd/2 w^2 + (Lambda Kd e + Lambda M r) w).
+    From the chain rule above: -Kp r^2 - Kd/2 (qd - w)^2 + T' (Kd/2 w^2 + (Lambda Kd e + Lambda
+    M r) w).
     """
     r, x, w = sp.symbols("r x w", real=True)
     rate = -Kp * r**2 - Kd / 2 * (r - x - w) ** 2
@@ -150,7 +155,7 @@ def one_joint(grows: float, Kp: float, Kd: float, Lambda: float, M: float) -> An
 
 
 @pytest.mark.parametrize("grows", [-1.0, -0.1, -1e-3, -1e-6])
-def test_a_delay_that_shrinks_lets_v_rise_however_slowly(grows: float) -> None:
+def test_any_shrinking_delay_lets_v_rise(grows: float) -> None:
     """Errata 8: all arms in common motion, r = 0, Lambda e = -qd: V' = -T'/2 |qd|^2 > 0."""
     form = one_joint(grows, 1.0, 3.0, 1.0, 5.83)
     state = np.array([0.0, -1.0, 1.0])
@@ -161,7 +166,7 @@ def test_a_delay_that_shrinks_lets_v_rise_however_slowly(grows: float) -> None:
 @pytest.mark.parametrize(
     "gains", [(1.0, 3.0, 1.0, 5.83), (20.0, 5.0, 2.0, 0.17), (0.1, 10.0, 1.0, 1.0)]
 )
-def test_a_delay_that_grows_slowly_enough_does_not(
+def test_slowly_growing_delays_keep_v_falling(
     gains: tuple[float, float, float, float],
 ) -> None:
     """Errata 8: T' (Kd + Lambda M)^2 <= 2 Kp Kd (1 - T') is where V' <= 0 ends."""

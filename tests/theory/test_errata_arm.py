@@ -23,7 +23,7 @@ from trilat_net.core.arms.two_link_arm import ArmLinks, regressor, theta_from_li
 
 
 def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
-    """Euler and Lagrange's equations of two rigid links, with nothing of the paper in them."""
+    """Returns Euler and Lagrange's equations of two rigid links, with nothing of the paper in them."""
     t = sp.Symbol("t")
     m1, m2, l1, c1, c2, i1, i2 = sp.symbols("m1 m2 l1 lc1 lc2 I1 I2", positive=True)
     f = [sp.Function("a")(t), sp.Function("b")(t)]
@@ -46,7 +46,7 @@ def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
 
 
 def theta_24(n: dict[str, Any], last: Any) -> list[Any]:
-    """Eq. (24) with its last entry given."""
+    """Returns Eq. (24) with its last entry given."""
     outer = n["m2"] * n["lc2"] ** 2 + n["I2"]
     first = n["m1"] * n["lc1"] ** 2 + n["m2"] * n["l1"] ** 2 + n["I1"] + outer
     gravity4 = n["m1"] * n["lc1"] + n["m2"] * n["l1"]
@@ -71,7 +71,10 @@ def test_theta_5_is_m2_lc2_unlike_eq_24() -> None:
 
 
 def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
-    """Errata 2, Eq. (12): with one, it is right where v = qd and nowhere else."""
+    """Errata 2, Eq.
+
+    (12): with one velocity the regressor is right where v = qd and nowhere else.
+    """
     v, a = pair("v"), pair("a")
     assert sp.expand(columns(v, a) * THETA - forces(v, a)) == sp.zeros(2, 1)
     # Section IV's, at v
@@ -81,7 +84,7 @@ def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
     assert off.subs(dict(zip(v, QD, strict=True))).applyfunc(sp.expand) == sp.zeros(2, 1)
 
 
-def test_the_programs_regressor_is_that_of_the_energies() -> None:
+def test_programs_regressor_equals_the_energies() -> None:
     """Errata 2: Y theta of `core.arm`, with its own theta, against Euler and Lagrange."""
     torque, n = lagrange()
     links = ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07)
@@ -99,7 +102,7 @@ def test_the_programs_regressor_is_that_of_the_energies() -> None:
         )
 
 
-def test_five_parameters_are_four_where_the_length_is_known() -> None:
+def test_known_lengths_reduce_five_parameters_to_four() -> None:
     """Errata 3, Eq. (24): theta_2 = l1 theta_5."""
     _, n = lagrange()
     theta = theta_24(n, n["m2"] * n["lc2"])
@@ -115,7 +118,7 @@ def test_five_parameters_are_four_where_the_length_is_known() -> None:
     assert four @ np.delete(theta, 1) == pytest.approx(theta)
 
 
-def test_no_acceleration_at_the_start_contradicts_an_estimate_of_zero() -> None:
+def test_zero_estimates_contradict_zero_initial_acceleration() -> None:
     """Errata 4: level and at rest, tau = G_hat, so that qdd(0) = M^-1 (G_hat - G) = (-g, g)."""
     level = dict.fromkeys([*Q, *QD], 0)
     point_masses = dict(zip(THETA, (3, 1, 1, 2, 1), strict=True))

@@ -1,4 +1,6 @@
-"""The corrections of docs/theory/errata-proof.md, continued: weights, hands, convergence, and what dominance means."""
+"""The corrections of docs/theory/errata-proof.md, continued: weights, hands, convergence, and
+the meaning of dominance.
+"""
 
 from typing import Any
 
@@ -30,13 +32,13 @@ SQUARES = sp.Matrix(sp.symbols("Q1:4", positive=True))
 
 
 def shares(rng: np.random.Generator, size: int) -> Any:
-    """A dominance matrix of so many sites."""
+    """Draws a dominance matrix for a number of sites."""
     alpha = rng.uniform(0.05, 1.0, (size, size)) * (1 - np.eye(size))
     return alpha / alpha.sum(axis=1, keepdims=True)
 
 
 def perron(alpha: Any) -> Any:
-    """Its left eigenvector of eigenvalue 1, from NumPy, sum 1."""
+    """Returns the left eigenvector of eigenvalue 1, from NumPy, sum 1."""
     values, vectors = np.linalg.eig(alpha.T)
     vector = np.real(vectors[:, np.argmin(np.abs(values - 1))])
     return vector / vector.sum()
@@ -45,21 +47,24 @@ def perron(alpha: Any) -> Any:
 # --- 6: beta --------------------------------------------------------------------------------------------
 
 
-def test_beta_is_left_null_vector_and_ones_right_one() -> None:
+def test_beta_is_the_left_null_vector() -> None:
     """Errata 6, after Eq. (20)."""
     assert (PI * UPSILON).expand() == sp.zeros(1, 3)
     assert (UPSILON * ONES.T).expand() == sp.zeros(3, 1)
     assert (ONES * UPSILON).expand() != sp.zeros(1, 3)
 
 
-def test_ones_work_on_one_parameter_of_the_three() -> None:
+def test_ones_fit_one_of_three_parameters() -> None:
     """Errata 6: alpha12 = alpha31 = 1 - alpha21, the circulant matrices."""
-    (found,) = sp.solve(list(ONES * UPSILON), [A12, A31], dict=True)
-    assert found == {A12: 1 - A21, A31: 1 - A21}
+    (solution,) = sp.solve(list(ONES * UPSILON), [A12, A31], dict=True)
+    assert solution == {A12: 1 - A21, A31: 1 - A21}
 
 
-def test_eq_22_has_the_other_sign_of_eq_21() -> None:
-    """Errata 6, Eq. (21)-(23): it goes unnoticed as the term is zero, if beta is right."""
+def test_eq_22_has_the_opposite_sign() -> None:
+    """Errata 6, Eq.
+
+    (21)-(23): the sign goes unnoticed because the term is zero, if beta is right.
+    """
     beta = sp.Matrix([sp.symbols("b1:4", positive=True)])
     ends = sum(beta[i] * (SQUARES[i] - (ALPHA * SQUARES)[i]) for i in range(3))
     assert sp.expand(ends + (beta * UPSILON * SQUARES)[0]) == 0
@@ -69,7 +74,9 @@ def test_eq_22_has_the_other_sign_of_eq_21() -> None:
 
 
 def test_with_ones_v_can_rise() -> None:
-    """Errata 6: one arm moves, its peers saw it move before; r = 0, and its column sums to more than one."""
+    """Errata 6: one arm moves, and its peers used its motion before; r = 0, and its column sums
+    to more than one.
+    """
     alpha = np.array([[0.0, 0.9, 0.1], [0.5, 0.0, 0.5], [0.2, 0.8, 0.0]])
     qd = np.array([0.0, 1.0, 0.0])
     # of every peer what makes the disagreement zero
@@ -88,7 +95,7 @@ def test_with_ones_v_can_rise() -> None:
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 6])
-def test_programs_weights_are_left_eigenvectors_for_any_number_of_sites(size: int) -> None:
+def test_weights_are_left_eigenvectors_for_all_n(size: int) -> None:
     """Errata 6, N sites."""
     alpha = shares(np.random.default_rng(size), size)
     assert left_perron_vector(alpha) == pytest.approx(perron(alpha), rel=1e-9)
@@ -101,20 +108,22 @@ def test_programs_weights_are_left_eigenvectors_for_any_number_of_sites(size: in
 
 
 def passed_on(alpha: Any, Kd: Any) -> Any:
-    """Rows: what beta has to cancel of |qd_j|^2, per joint; shape (joints * N, N), times beta."""
+    """Returns rows: the terms in |qd_j|^2 that beta has to cancel, per joint; shape (joints *
+    N, N), times beta.
+    """
     rows = [(alpha - np.eye(len(alpha))).T * Kd[:, joint] for joint in range(Kd.shape[1])]
     return np.concatenate(rows)
 
 
 def feasible(alpha: Any, Kd: Any) -> bool:
-    """Whether some beta >= 0, not zero, leaves nothing positive."""
+    """True if some beta >= 0, not zero, leaves nothing positive."""
     rows = passed_on(alpha, Kd)
     n = len(alpha)
-    found = linprog(np.zeros(n), rows, np.full(len(rows), 1e-9), np.ones((1, n)), [1.0])
-    return bool(found.status == 0)
+    solution = linprog(np.zeros(n), rows, np.full(len(rows), 1e-9), np.ones((1, n)), [1.0])
+    return bool(solution.status == 0)
 
 
-def test_kd_may_differ_by_a_scalar_per_site_only() -> None:
+def test_kd_may_differ_by_scalars_only() -> None:
     """Errata 7: beta_i = pi_i / c_i; of another shape there is no beta, not even for V' <= 0."""
     alpha, c = shares(np.random.default_rng(3), 3), np.array([10.0, 3.0, 0.3])
     common = c[:, np.newaxis] * [2.0, 5.0]
@@ -127,13 +136,13 @@ def test_kd_may_differ_by_a_scalar_per_site_only() -> None:
 
 
 def test_no_weights_of_the_integrals_leave_slack() -> None:
-    """Errata 7: with w_ij in the integral what is left sums to alpha_ij (k_i - w_ij)^2 / (2 w_ij) >= 0."""
+    """Errata 7: with w_ij in the integral the remainder sums to alpha_ij (k_i - w_ij)^2 / (2 w_ij) >= 0."""
     k, w = sp.symbols("k w", positive=True)
-    own, seen = sp.symbols("own seen", real=True)
-    (best,) = sp.solve(sp.diff(k * own * seen - w * seen**2 / 2, seen), seen)
+    own_share, seen = sp.symbols("own seen", real=True)
+    (best,) = sp.solve(sp.diff(k * own_share * seen - w * seen**2 / 2, seen), seen)
     # over what the peer may have done
-    most = (k * own * seen - w * seen**2 / 2).subs(seen, best)
-    assert sp.simplify(most - k**2 * own**2 / (2 * w)) == 0
+    most = (k * own_share * seen - w * seen**2 / 2).subs(seen, best)
+    assert sp.simplify(most - k**2 * own_share**2 / (2 * w)) == 0
     assert sp.simplify(-k + k**2 / (2 * w) + w / 2 - (k - w) ** 2 / (2 * w)) == 0
 
 
@@ -141,7 +150,9 @@ def test_no_weights_of_the_integrals_leave_slack() -> None:
 
 
 def test_a_passive_wall_gives_energy_to_v() -> None:
-    """Errata 9: at rest in a wall, held there by its peers, qd'tau_h = 0 and r'tau_h = Lambda e'tau_h > 0."""
+    """Errata 9: at rest in a wall, held there by its peers, qd'tau_h = 0 and r'tau_h = Lambda
+    e'tau_h > 0.
+    """
     wall = TorqueSource(TorqueKind.WALL, a=(1.1, 0.0), b=(-1.0, 0.0), K=(2000.0, 0.0))
     rows, table = torque_source_rows((wall,))
 
@@ -167,8 +178,10 @@ def test_a_passive_wall_gives_energy_to_v() -> None:
 # --- 10: convergence ------------------------------------------------------------------------------------
 
 
-def test_a_rate_that_vanishes_does_not_make_a_limit() -> None:
-    """Errata 10: e = sin(ln(1 + t)): its rate is square integrable and goes to zero, and e never settles."""
+def test_a_vanishing_rate_implies_no_limit() -> None:
+    """Errata 10: e = sin(ln(1 + t)): its rate is square integrable and goes to zero, and e
+    never settles.
+    """
     t = sp.Symbol("t", positive=True)
     e = sp.sin(sp.log(1 + t))
     rate = sp.diff(e, t)
@@ -179,7 +192,7 @@ def test_a_rate_that_vanishes_does_not_make_a_limit() -> None:
     assert [e.subs(t, when) for when in late] == [1, -1]
 
 
-def test_weighted_errors_are_what_moved_while_samples_were_under_way() -> None:
+def test_weighted_errors_equal_motion_under_way() -> None:
     """Errata 10.4: sum pi_i e_i = sum pi_i alpha_ij (q_j(t) - q_j(t - T_ij)); the step to 3c omits it."""
     q = sp.Matrix(sp.symbols("q1:4"))
     seen = sp.Matrix(3, 3, lambda i, j: sp.Symbol(f"q{j + 1}_at_{i + 1}"))
@@ -196,8 +209,8 @@ def test_weighted_errors_are_what_moved_while_samples_were_under_way() -> None:
     ] * 3  # arms that drift together have e = c T
 
 
-def test_nothing_but_rest_is_left() -> None:
-    """Errata 10.4: what w is multiplied with, sum pi_i / Lambda_i + sum pi_i alpha_ij T_ij, is positive."""
+def test_only_rest_remains() -> None:
+    """Errata 10.4: the factor of w, sum pi_i / Lambda_i + sum pi_i alpha_ij T_ij, is positive."""
     rng = np.random.default_rng(4)
     for _ in range(50):
         alpha = shares(rng, 4)
@@ -215,28 +228,28 @@ LOCKED = {"m1": {"s": 1.0, "m2": 0.0}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 
 """Expert and slave follow each other; the trainee follows both."""
 
 
-def test_a_weight_is_zero_where_the_other_two_are_locked() -> None:
+def test_locked_pairs_leave_a_zero_weight() -> None:
     """Errata 11: 1 - alpha_ij alpha_ji = 0 with shares of at most one."""
     assert list(PI.subs({A12: 0, A31: 1})) == [1, 0, 1]
-    for own in (0.2, 0.7, 0.999):
-        assert min(PI.subs({A12: 1 - own, A31: 1, A21: 0.5})) > 0
+    for share in (0.2, 0.7, 0.999):
+        assert min(PI.subs({A12: 1 - share, A31: 1, A21: 0.5})) > 0
 
 
-def test_a_site_that_nobody_follows_settles_all_the_same() -> None:
+def test_sites_that_nobody_follows_still_settle() -> None:
     """Errata 11: V with beta = (1, 0, 1) never rises; V_2 alone may; e goes to zero at every site."""
     rows = {
         f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()
     }
-    made = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
-    locked = balance(made, np.array([0.5, 0.0, 0.5])).V
+    trajectory_of_run = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
+    locked = balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
     assert np.diff(locked).max() <= 1e-6 * locked.max()
-    alone = balance(made, np.array([0.0, 1.0, 0.0])).V
+    alone = balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V
     assert np.diff(alone).max() > 1e-6 * alone.max()
-    e = np.abs(made.stack("q") - made.stack("q_des")).max(axis=(0, 2))
+    e = np.abs(trajectory_of_run.stack("q") - trajectory_of_run.stack("q_des")).max(axis=(0, 2))
     assert e[-200:].max() < 0.02 < 0.5 < e.max()
 
 
-def test_four_sites_in_two_closed_groups_have_no_one_beta() -> None:
+def test_two_closed_groups_have_several_betas() -> None:
     """Errata 11, N >= 4."""
     alpha = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
     assert np.linalg.matrix_rank(alpha - np.eye(4)) == 2
@@ -257,7 +270,7 @@ def test_learning_gravity_is_a_spring() -> None:
     )
 
 
-def test_dominance_is_who_feels_whom() -> None:
+def test_dominance_decides_who_feels_whom() -> None:
     """Errata 12: at rest sum beta_i tau_h,i = 0, so that a hand at i feels tau_s beta_s / beta_i."""
     alpha = np.array([[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]])
     beta, stiffness = perron(alpha), 40.0

@@ -33,7 +33,7 @@ class Loop(NamedTuple):
 
     @property
     def growth_per_s(self) -> float:
-        """That of the slowest motion."""
+        """Growth of the slowest motion, 1/s."""
         assert self.found.rightmost is not None
         return self.found.rightmost.s.real
 
@@ -41,24 +41,26 @@ class Loop(NamedTuple):
 def at_rest(
     name: str, changes: Mapping[str, Any], wanted: int = 4, pose: tuple[float, ...] = POSE
 ) -> Loop:
-    """A scenario with all sites at rest at a pose, and its roots there."""
+    """Returns a scenario with all sites at rest at a pose, and its roots there."""
     scenario = load_scenario(name, changes)
-    here = {f"sites.{site}.q0_rad": list(pose) for site in scenario.names}
+    starts = {f"sites.{site}.q0_rad": list(pose) for site in scenario.names}
     scenario = load_scenario(
-        scenario, here | {f"sites.{site}.hands": [] for site in scenario.names}
+        scenario, starts | {f"sites.{site}.hands": [] for site in scenario.names}
     )
-    found = compute_sampled_spectrum(
+    spectrum = compute_sampled_spectrum(
         derive_operating_conditions(scenario), find_equilibrium(scenario, pose), wanted
     )
-    assert found is not None
-    return Loop(scenario, found)
+    assert spectrum is not None
+    return Loop(scenario, spectrum)
 
 
 def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> float:
-    """How fast the difference of two runs grows, of which one starts beside the other, 1/s.
+    """Measures the growth of the difference of two runs, of which one starts beside the other,
+    1/s.
 
-    The speeds at whole periods follow a recurrence, whatever happens within; that of least norm has its
-    other roots inside. Kumaresan and Tufts, IEEE Trans. Acoustics, Speech, Signal Processing 30 (1982).
+    The speeds at whole periods follow a recurrence, for any motion within a period; the
+    recurrence of least norm has its other roots inside. Kumaresan and Tufts, IEEE Trans.
+    Acoustics, Speech, Signal Processing 30 (1982).
     """
     whole = load_scenario(loop.scenario, {"duration_s": to_s})
     pushes = np.random.default_rng(1).uniform(-push_rad, push_rad, (len(whole.names), 2, 2))
@@ -93,7 +95,7 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
 
 
 def speeds(scenario: Scenario) -> list[Array]:
-    """The joint speeds of every record of each site."""
+    """Returns the joint speeds of every record of each site."""
     run = FusedRun(scenario, keep=max(map(scenario.ticks, scenario.names)))
     run.advance_to(scenario.duration_s)
     assert run.diverged_s is None
@@ -111,9 +113,11 @@ LAWS = (
 
 
 def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
-    """A loop of one, two or three tick rates, with the push, begin and end of a measurement by twins.
+    """Draws a loop of one, two or three tick rates, with the push, begin and end of a
+    measurement by twins.
 
-    None if its slowest motion is lost in rounding, or leaves the small ones, before the next has died.
+    None if its slowest motion is lost in rounding, or leaves the small ones, before the next
+    has died.
     """
     rng = np.random.default_rng(seed)
     control = dict(LAWS[seed % 3])
@@ -125,7 +129,7 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
     shipped = load_scenario(name)
     sites = shipped.names
     if control["law"] == "adaptive":
-        control["theta_hat0"] = [float(one) for one in shipped.arms[sites[0]].theta]
+        control["theta_hat0"] = [float(parameter) for parameter in shipped.arms[sites[0]].theta]
     rates = rng.choice([40, 50, 60, 80, 100, 150, 200], len(sites)).tolist()
     mean_ms = float(rng.integers(0, 400))
     sine = {"model": "sine", "amplitude_ms": round(mean_ms * rng.uniform(0.3, 1.0), 1)}
@@ -146,7 +150,9 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
         changes[f"sites.{site}.rate_hz"] = int(rates[n if seed % 5 < 3 else 0])
     loop = at_rest(name, changes, 6)
     reals = [root.s.real for root in loop.found.roots]
-    gap_per_s = reals[0] - next((one for one in reals if one < reals[0] - 1e-3), reals[0] - 1.0)
+    gap_per_s = reals[0] - next(
+        (real for real in reals if real < reals[0] - 1e-3), reals[0] - 1.0
+    )
     from_s = max(4.0, 2.0 / max(0.1, gap_per_s))
     to_s = from_s + max(20.0 * max(1.0, loop.found.span_s or 0.0), min(120.0, 4.0 / gap_per_s))
     size = reals[0] * to_s
@@ -156,7 +162,7 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
 
 
 def compare_with_twins(seed: int) -> bool:
-    """Compares a drawn loop with its twins; False if none can tell."""
+    """Compares a drawn loop with its twins; False if the twins cannot decide."""
     drawn = draw_loop(seed)
     if drawn is None:
         return False
@@ -167,20 +173,20 @@ def compare_with_twins(seed: int) -> bool:
 
 
 @pytest.mark.parametrize("seed", [20, 69, 90])
-def test_twins_of_runs_grow_as_the_roots_say(seed: int) -> None:
+def test_twins_of_runs_grow_at_their_roots(seed: int) -> None:
     """An adaptive loop of two rates and a sine, three rates, and one rate at a constant delay."""
     assert compare_with_twins(seed)
 
 
 @pytest.mark.long
-def test_twins_of_sixty_loops_grow_as_the_roots_say() -> None:
-    """A third of them at several tick rates, and most with delays that follow a sine."""
+def test_sixty_twins_grow_at_their_roots() -> None:
+    """A third of the loops at several tick rates, and most with delays that follow a sine."""
     assert len([*islice(filter(compare_with_twins, range(400)), 60)]) == 60
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law["law"])
 @pytest.mark.parametrize("delay_ms", [0.0, 30.0, 200.0])
-def test_at_one_rate_they_are_eigenvalues_of_companion_matrix(
+def test_one_rate_gives_companion_matrix_eigenvalues(
     law: dict[str, Any], delay_ms: float
 ) -> None:
     damped = {} if law["law"] == "adaptive" else {"d": 1.3}
@@ -202,26 +208,28 @@ def test_at_one_rate_they_are_eigenvalues_of_companion_matrix(
 @pytest.mark.parametrize(
     ("rates_hz", "growth_per_s", "period_s"), [((30, 30), 0.595, None), ((40, 30), 0.180, 0.1)]
 )
-def test_a_digital_pair_grows_where_continuous_time_is_damped_enough(
+def test_digital_pairs_may_grow_despite_continuous_damping(
     rates_hz: tuple[int, int], growth_per_s: float, period_s: float | None
 ) -> None:
     """K 50, d 2 against a bound of 1.667 at one tick of 30 Hz; folded, joint 2 has 1 kg m^2."""
     rates = {"sites.m.rate_hz": rates_hz[0], "sites.s.rate_hz": rates_hz[1]}
     control = {"law": "p_d", "K": 50.0, "d": 2.0}
     changes = {**rates, "scheme": "digital", "control": control, "link.delay_ms": 0.0}
-    found = at_rest("two_sites", changes, pose=(0.0, math.pi)).found
-    assert found.rightmost is not None
-    assert found.rightmost.s.real == pytest.approx(growth_per_s, abs=5e-4)
-    assert found.rightmost.s.imag == pytest.approx(9.9, abs=0.2)
-    assert (found.verdict, found.span_s) == ("unstable", period_s)
+    roots = at_rest("two_sites", changes, pose=(0.0, math.pi)).found
+    assert roots.rightmost is not None
+    assert roots.rightmost.s.real == pytest.approx(growth_per_s, abs=5e-4)
+    assert roots.rightmost.s.imag == pytest.approx(9.9, abs=0.2)
+    assert (roots.verdict, roots.span_s) == ("unstable", period_s)
 
 
 SINE_S = 1.4
 SINE = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 195.0, "period_s": SINE_S}
 
 
-def test_sine_pumps_loop_that_its_mean_delay_leaves_stable() -> None:
-    """P+d, d 1.1, 200 +- 195 ms: it swings at half the frequency of the delay, which closes in on itself."""
+def test_sinusoidal_delays_can_pump_stable_loops() -> None:
+    """P+d, d 1.1, 200 +- 195 ms: the loop swings at half the frequency of the delay, which
+    excites it parametrically.
+    """
     changes, straight = {"rate_hz": 200, "control.d": 1.1}, (0.1, 0.0)
     mean = {"model": "constant", "delay_ms": 202.5}
     assert at_rest("p_d_margin", {**changes, "link": mean}, pose=straight).growth_per_s < -0.01
@@ -233,7 +241,7 @@ def test_sine_pumps_loop_that_its_mean_delay_leaves_stable() -> None:
 
 @pytest.mark.parametrize("period_s", [1.4, 1.2517, 0.58317])
 def test_the_period_is_that_of_the_draws(period_s: float) -> None:
-    """Or, where it is no multiple of the tick, all but a few of a hundred samples are the same again."""
+    """For a period that is no multiple of the tick, all but a few of a hundred samples repeat."""
     changes = {
         "sites.m.rate_hz": 200,
         "sites.s.rate_hz": 150,
@@ -251,7 +259,7 @@ def test_the_period_is_that_of_the_draws(period_s: float) -> None:
         assert np.mean(drawn[: len(later)] != later) <= (0.0 if period_s == SINE_S else 0.05)
 
 
-def test_drawn_delays_grow_like_twins_of_the_same_draws() -> None:
+def test_drawn_delays_grow_like_their_twins() -> None:
     """From one window of 3 s to another; the span of the roots begins earlier in the same draws."""
     link = {"model": "normal", "delay_ms": 200.0, "deviation_ms": 80.0, "loss": 0.3}
     changes = {"rate_hz": 100, "control.d": 1.0, "link": link, "duration_s": 30.0}
@@ -260,16 +268,16 @@ def test_drawn_delays_grow_like_twins_of_the_same_draws() -> None:
     assert loop.found.deviation_per_s is not None
     assert 1e-3 < loop.found.deviation_per_s < 0.02
     beside = load_scenario(loop.scenario, {"sites.s.q0_rad": [POSE[0] + 1e-7, 0.0]})
-    apart = np.hstack(
+    distances = np.hstack(
         [a - b for a, b in zip(speeds(loop.scenario), speeds(beside), strict=True)]
     )
-    first, last = (np.linalg.norm(apart[from_s * 100 :][:300]) for from_s in (2, 27))
+    first, last = (np.linalg.norm(distances[from_s * 100 :][:300]) for from_s in (2, 27))
     assert math.log(last / first) / 25.0 == pytest.approx(
         loop.growth_per_s, abs=3.0 * loop.found.deviation_per_s
     )
 
 
-def test_what_drifts_at_any_delays_is_told_from_what_stays(
+def test_drifting_motions_differ_from_staying_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A free mass, and one that follows it: a shared place stays, and both may go on at one speed."""
@@ -283,14 +291,14 @@ def test_what_drifts_at_any_delays_is_told_from_what_stays(
         S, {(1, 0): effect}, ("m.q1", "m.qd1", "s.q1", "s.qd1"), np.array([0, 0, 1, 1]), 0
     )
     monkeypatch.setattr(floquet, "couple_ticks", lambda *_, **__: hand_made)
-    found = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
-    assert (found.zeros, found.drifting, found.verdict) == (2, 1, "at the edge")
-    assert found.rightmost is not None
+    roots = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
+    assert (roots.zeros, roots.drifting, roots.verdict) == (2, 1, "at the edge")
+    assert roots.rightmost is not None
     exact = np.log(np.roots([1.0, -(2.0 - h * d), 1.0 - h * d + h * h * K]).astype(complex)) / h
-    assert found.rightmost.s == pytest.approx(exact[np.argmax(exact.imag)], abs=1e-6)
+    assert roots.rightmost.s == pytest.approx(exact[np.argmax(exact.imag)], abs=1e-6)
 
 
-def test_loop_that_grows_thousandfold_in_tick_has_its_root() -> None:
+def test_thousandfold_growth_per_tick_has_its_root() -> None:
     control = {"law": "p_d", "K": 1.0, "d": 1e5}
     loop = at_rest(
         "two_sites",

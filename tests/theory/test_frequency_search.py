@@ -17,7 +17,7 @@ HZ = 2.0 * np.pi
 
 
 @given(low_hz=st.floats(1e-4, 1.0), decades=st.floats(0.1, 5.0), delay_s=st.floats(0.0, 3.0))
-def test_grid_spans_its_band_in_order_and_follows_round_trip(
+def test_grids_span_bands_and_follow_delays(
     low_hz: float, decades: float, delay_s: float
 ) -> None:
     high_hz = low_hz * 10.0**decades
@@ -30,31 +30,31 @@ def test_grid_spans_its_band_in_order_and_follows_round_trip(
 
 
 @given(at_hz=st.floats(0.01, 10.0), width=st.floats(0.002, 1.0))
-def test_a_dip_between_grid_points_is_found_to_a_percent(at_hz: float, width: float) -> None:
+def test_dips_between_grid_points_are_found(at_hz: float, width: float) -> None:
     """A Lorentzian whose half width is down to a thirtieth of the grid's steps."""
 
     def curve(w: Array) -> Array:
         return np.asarray(0.1 - 1.0 / (1.0 + (np.log(w / (HZ * at_hz)) / width) ** 2))
 
-    found = find_minima(curve, build_frequency_grid(1e-3, 100.0, 0.0))
-    assert found.least == pytest.approx(-0.9, rel=0.02)
-    assert found.least_hz == pytest.approx(at_hz, rel=0.2 * width)
-    (span,) = found.below
+    minima = find_minima(curve, build_frequency_grid(1e-3, 100.0, 0.0))
+    assert minima.least == pytest.approx(-0.9, rel=0.02)
+    assert minima.least_hz == pytest.approx(at_hz, rel=0.2 * width)
+    (span,) = minima.below
     assert span.from_hz == pytest.approx(max(1e-3, at_hz * np.exp(-3.0 * width)), rel=1e-6)
     assert span.to_hz == pytest.approx(min(100.0, at_hz * np.exp(3.0 * width)), rel=1e-6)
 
 
-def test_ranges_below_a_level_have_the_edges_of_the_curve() -> None:
-    found = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
+def test_ranges_below_levels_have_exact_edges() -> None:
+    curve_minima = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
     expected = [(1 / 6, 5 / 6), (7 / 6, 11 / 6)]
-    np.testing.assert_allclose(found.below, np.array(expected), rtol=1e-6)
-    begun = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
-    np.testing.assert_allclose(begun.below, [(0.6, 1.0)], rtol=1e-6)
+    np.testing.assert_allclose(curve_minima.below, np.array(expected), rtol=1e-6)
+    minima = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
+    np.testing.assert_allclose(minima.below, [(0.6, 1.0)], rtol=1e-6)
     ended = find_minima(np.sin, HZ * np.linspace(0.1, 0.9, 200), level=0.0)
     np.testing.assert_allclose(ended.below, [(0.5, 0.9)], rtol=1e-6)
 
 
-def test_what_is_below_by_less_than_tolerance_is_not_below() -> None:
+def test_deviations_within_tolerance_are_not_below() -> None:
     def shallow(w: Array) -> Array:
         return np.full(len(w), -1e-9)
 
@@ -63,20 +63,20 @@ def test_what_is_below_by_less_than_tolerance_is_not_below() -> None:
     assert find_minima(shallow, w).below
 
 
-def test_a_band_too_wide_for_its_delay_is_followed_partly() -> None:
+def test_bands_too_wide_are_followed_partly() -> None:
     assert find_resolved_hz(1e-3, 100.0, 0.2) == 100.0
     assert find_resolved_hz(1e-3, 100.0, 1.6) == 100.0
     assert find_resolved_hz(1e-3, 1000.0, 1.6) == pytest.approx(1.3, rel=0.05)
 
 
-def test_a_flat_curve_and_a_rising_one_have_no_dip() -> None:
+def test_flat_and_rising_curves_have_no_dip() -> None:
     w = build_frequency_grid(0.1, 1.0, 0.0)
     assert find_minima(lambda at: np.asarray(at), w).least == w[0]
     assert not find_minima(lambda at: np.asarray(at), w).below
 
 
 def test_a_sharp_resonance_is_resolved() -> None:
-    """Quality 1000: the peak is a thousandth wide, the grid's steps are sixty times that."""
+    """Quality 1000: the peak is a thousandth wide, the grid's steps are sixty times wider."""
     network = Network((1.0,), (1e-3,), (1.0,))
     Y = build_admittance(network.loop)
     w = refine_frequencies(Y, build_frequency_grid(1e-2, 10.0, 0.0))
@@ -92,17 +92,17 @@ def test_an_undamped_resonance_ends_the_refinement() -> None:
     assert len(w) < 6000
 
 
-def test_answer_that_is_remembered_is_same_and_asked_once() -> None:
-    asked: list[int] = []
+def test_remembered_answers_are_asked_once() -> None:
+    questions: list[int] = []
     Y = build_admittance(pair().loop)
 
     def counted(w: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
-        asked.append(len(w))
+        questions.append(len(w))
         return Y(w)
 
     w = build_frequency_grid(0.1, 1.0, 0.2)
-    known = cache_response(counted, w)
-    np.testing.assert_array_equal(known(w), Y(w))
-    np.testing.assert_array_equal(known(w), Y(w))
-    np.testing.assert_array_equal(known(w[:3]), Y(w[:3]))
-    assert asked == [len(w), 3]
+    cached_response = cache_response(counted, w)
+    np.testing.assert_array_equal(cached_response(w), Y(w))
+    np.testing.assert_array_equal(cached_response(w), Y(w))
+    np.testing.assert_array_equal(cached_response(w[:3]), Y(w[:3]))
+    assert questions == [len(w), 3]

@@ -1,6 +1,7 @@
-"""Loops of laws with states, waves and accelerations: against closed equations of one mass, and their roots.
+"""Loops of laws with states, waves and accelerations: against closed equations of one mass, and
+their roots.
 
-The unit arm is two masses that do not know of each other: 1 along (1, 1/2) and 1/6 across.
+The unit arm is two uncoupled masses: 1 along (1, 1/2) and 1/6 across.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.transmission import PAIR, TABLE, VARIANTS, balance, printed, transmitted
+from tests.transmission import PAIR, TABLE, VARIANTS, approximate_printed, balance, transmitted
 from tests.unit_arm import CLAMP, hand, two_sites, unit_scenario
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
@@ -36,15 +37,15 @@ def loop_of(scenario: Scenario) -> LinearLoop:
     )
 
 
-def felt(loop: LinearLoop, s: complex, site: int = 0) -> complex:
-    """Torque over velocity at a site, along the line of the mass of 1."""
+def find_impedance(loop: LinearLoop, s: complex, site: int = 0) -> complex:
+    """Returns torque over velocity at a site, along the line of the mass of 1."""
     ports = slice(2 * site, 2 * site + 2)
     Y = evaluate_transfer(loop, np.array([s]))[0, ports, ports]
     return complex(1.0 / (Y @ ALONG)[0])
 
 
 def count_inside(f: Callable[[complex], complex], low: complex, high: complex) -> int:
-    """The number of zeros of an entire function in a rectangle, by the turns of its argument."""
+    """Returns the number of zeros of an entire function in a rectangle, by the turns of its argument."""
     corners = [low, complex(high.real, low.imag), high, complex(low.real, high.imag), low]
     path = np.concatenate([np.linspace(a, z, 4001)[:-1] for a, z in pairwise(corners)])
     values = np.array([f(s) for s in path])
@@ -54,9 +55,8 @@ def count_inside(f: Callable[[complex], complex], low: complex, high: complex) -
 
 
 def wave_equation(s: complex, mass: float, wall: float) -> complex:
-    """Zero at the roots of a master with a hand of 50 + 10 s, a line, and a slave with K and B = b.
-
-    u_m and v_s are what comes out of the line at the slave and at the master, times c.
+    """Is zero at the roots of a master with a hand of 50 + 10 s, a line, and a slave with K and
+    B = b. u_m and v_s are the outputs of the line at the slave and at the master, times c.
     """
     e = np.exp(-s * T)
     # unknowns: x_m, x_s, y = q_sd, and c u, c v of what is sent: by the master, by the slave
@@ -81,8 +81,8 @@ def wave_pair(wall: float = 0.0, held: bool = True) -> Scenario:
 
 
 @pytest.mark.parametrize("wall", [pytest.param(0.0, marks=pytest.mark.long), 1000.0])
-def test_roots_of_a_wave_line_are_those_of_its_delays(wall: float) -> None:
-    """All of them below 30 rad/s as far left as they were asked for, counted by the turns of the argument."""
+def test_wave_line_roots_follow_their_delays(wall: float) -> None:
+    """All of them below 30 rad/s as far left as requested, counted by the turns of the argument."""
     spectrum = compute_delay_spectrum(loop_of(wave_pair(wall)), 24)
     for mass in (1.0, 1.0 / 6.0):
         ours = []
@@ -107,35 +107,35 @@ def test_roots_of_a_wave_line_are_those_of_its_delays(wall: float) -> None:
         assert inside
 
 
-def test_wave_line_feels_like_mass_and_like_spring() -> None:
+def test_wave_lines_feel_like_mass_and_spring() -> None:
     """LAWS of lines: of a free slave both masses and b T; clamped rigidly at .1 Hz 51.88 N m s/rad."""
     free = loop_of(wave_pair(held=False))
     slow, fast = (2j * np.pi * hz for hz in (0.01, 0.1))
-    assert abs(felt(free, slow) / slow) == pytest.approx(4.0004, abs=5e-5)
-    assert abs(felt(free, fast)) == pytest.approx(2.538, abs=5e-4)
-    assert abs(felt(clamp_site(free, "s"), fast)) == pytest.approx(51.88, abs=5e-3)
+    assert abs(find_impedance(free, slow) / slow) == pytest.approx(4.0004, abs=5e-5)
+    assert abs(find_impedance(free, fast)) == pytest.approx(2.538, abs=5e-4)
+    assert abs(find_impedance(clamp_site(free, "s"), fast)) == pytest.approx(51.88, abs=5e-3)
 
 
 @pytest.mark.parametrize(("variant", "delay_s"), [key for key in TABLE if key[1] > 0.0])
 def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> None:
-    """With accelerations and local force feedback, as far as an impedance has a last digit."""
+    """With accelerations and local force feedback, to the last digit of the impedance."""
     scenario = two_sites(variant, delay_s)
     sites = {**scenario.sites, "m": msgspec.structs.replace(scenario.sites["m"], hands=())}
     loop = loop_of(msgspec.structs.replace(scenario, sites=sites))
-    found = [
-        abs(felt(loop, 2j * np.pi * hz)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
+    ratios = [
+        abs(find_impedance(loop, 2j * np.pi * hz)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
-    assert found == [printed(value) for value in TABLE[variant, delay_s]]
+    assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
     exact = [
         transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 5.0)
     ]
-    assert [found[0], found[-1]] == pytest.approx(exact, rel=1e-9)
+    assert [ratios[0], ratios[-1]] == pytest.approx(exact, rel=1e-9)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("acceleration", [0.0, 0.5])
-def test_roots_of_four_channels_with_delay_solve_their_equation(acceleration: float) -> None:
+def test_delayed_four_channel_roots_solve_equations(acceleration: float) -> None:
     law = {"force_own": (0.2, -0.5), "acceleration": acceleration}
     scenario = two_sites("without qdd", 0.02, **law)
     loads = [(50.0, 10.0), (500.0, 5.0)]
@@ -165,24 +165,24 @@ def test_six_channels_with_accelerations_share_as_published(
 ) -> None:
     names, alpha = ("u1", "u2", "s"), complementary_shares(a)
     shares = {
-        one: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != one}
-        for i, one in enumerate(names)
+        site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
+        for i, site in enumerate(names)
     }
     sites: dict[str, Any] = {"u1": {}, "u2": {}, "s": {"hands": [hand(0.0, 500.0, 5.0)]}}
     law = {"law": "six_channel", "K": 100.0, "B": 20.0, "acceleration": 1.0}
     loop = set_common_delay(loop_of(unit_scenario(sites, law, dominance=shares)), 0.0)
-    found = [
-        abs(felt(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
+    ratios = [
+        abs(find_impedance(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 1.0)
     ]
-    assert found == [printed(value) for value in values]
+    assert ratios == [approximate_printed(value) for value in values]
 
 
 def solves(f: Callable[[complex], complex], s: complex) -> bool:
     return abs(f(s) / ((f(s + 1e-6) - f(s - 1e-6)) / 2e-6)) < 1e-6 * (1.0 + abs(s))
 
 
-def test_predictor_of_true_model_has_roots_of_no_delay() -> None:
+def test_true_models_predict_roots_without_delay() -> None:
     """s^2 + d s + 2 K, and of the slave s^2 + d s + K, along the mass that the model has."""
     law = {"law": "smith", "K": 100.0, "d": 5.0, "inertia": 1.0}
     sites = {"m": {"control": {**law, "predicts": True}}, "s": {}}
@@ -194,12 +194,12 @@ def test_predictor_of_true_model_has_roots_of_no_delay() -> None:
         assert min(abs(root - complex(wanted.real, abs(wanted.imag))) for root in roots) < 1e-6
 
 
-def test_users_who_share_authority_have_the_roots_of_their_springs() -> None:
+def test_shared_authority_has_its_springs_roots() -> None:
     a, d, K_a = 0.75, 5.0, 10.0
     names, alpha = ("u1", "u2", "s"), complementary_shares(a)
     shares = {
-        one: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != one}
-        for i, one in enumerate(names)
+        site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
+        for i, site in enumerate(names)
     }
     law = {"law": "authority", "K": K_a, "d": d}
     sites = {"u1": {}, "u2": {}, "s": {"control": {**law, "leads": False}}}
@@ -211,10 +211,11 @@ def test_users_who_share_authority_have_the_roots_of_their_springs() -> None:
     ]
 
     def users(s: complex) -> complex:
-        own = s * s + d * s
+        free_dynamics = s * s + d * s
         pulls = K_a * alpha[0, 1], K_a * alpha[1, 0]
         return complex(
-            (own + pulls[0]) * (own + pulls[1]) - pulls[0] * pulls[1] * np.exp(-2.0 * s * T)
+            (free_dynamics + pulls[0]) * (free_dynamics + pulls[1])
+            - pulls[0] * pulls[1] * np.exp(-2.0 * s * T)
         )
 
     assert sum(solves(users, s) for s in roots) >= 3
@@ -223,7 +224,7 @@ def test_users_who_share_authority_have_the_roots_of_their_springs() -> None:
 
 @pytest.mark.long
 def test_impedances_have_the_roots_of_their_masses() -> None:
-    """Free, with known dynamics, nothing comes back: M s^2 + B s + K at every site."""
+    """Free, with known dynamics, no force returns: M s^2 + B s + K at every site."""
     law = {"law": "impedance", "M": 2.0, "B": 10.0, "K": 50.0}
     sites = {"m": {}, "s": {"control": {**law, "follows": True}}}
     roots = [
@@ -235,7 +236,7 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
         assert root == pytest.approx(complex(wanted.real, abs(wanted.imag)), rel=1e-5)
 
 
-def test_synchronised_outputs_have_the_roots_of_their_consensus() -> None:
+def test_synchronised_outputs_have_consensus_roots() -> None:
     """Without gravity and with the true parameters: s = -Lambda, and m s = -K (1 -+ exp(-s T))."""
     law = {"law": "sync", "Lambda": 1.0, "K": 3.0}
     loop = loop_of(unit_scenario({"m": {}, "s": {}}, law))
@@ -255,21 +256,21 @@ def test_synchronised_outputs_have_the_roots_of_their_consensus() -> None:
     assert all(solves(consensus, root) for root in others)
 
 
-def test_laws_that_switch_by_energy_say_why_they_lack_roots() -> None:
+def test_energy_switching_laws_explain_missing_roots() -> None:
     for law, why in (("tanks", "tank"), ("tdpa", "second order")):
         with pytest.raises(ScenarioError, match=why):
             loop_of(unit_scenario({"m": {}, "s": {}}, {"law": law}))
 
 
 def test_the_analysis_of_waves_is_whole() -> None:
-    found = analyse_linear_loop(wave_pair(1000.0), pose=(0.0, 0.0))
-    assert found.verdict == "stable"
-    assert found.sampled is None
-    assert any("continuous time only" in note for note in found.notes)
-    assert found.margin.description.startswith("stable for every common delay")
+    analysis = analyse_linear_loop(wave_pair(1000.0), pose=(0.0, 0.0))
+    assert analysis.verdict == "stable"
+    assert analysis.sampled is None
+    assert any("continuous time only" in note for note in analysis.notes)
+    assert analysis.margin.description.startswith("stable for every common delay")
 
 
-def test_arms_that_line_holds_against_hands_are_at_rest_there() -> None:
+def test_lines_hold_arms_at_rest_against_hands() -> None:
     """A line between passive ends has no root to the right: its torque balances that of the operator."""
     follows = {"sites.s.control.K": 100.0, "sites.s.control.B": 10.0, "duration_s": 6.0}
     scenario = load_scenario(
@@ -281,16 +282,16 @@ def test_arms_that_line_holds_against_hands_are_at_rest_there() -> None:
     assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1
 
 
-def test_a_pull_that_saturates_is_linearised_where_it_does_not() -> None:
+def test_saturating_pulls_are_linearised_below_saturation() -> None:
     """Its loop is that of P+d with the same K and d, and the analysis says so."""
     loops = []
     for law in ({"law": "saturated_pd", "P": 5.0}, {"law": "p_d"}):
         scenario = unit_scenario(
             {"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0}
         )
-        found = analyse_linear_loop(scenario, pose=(0.0, 0.0))
-        loops.append([root.s for root in found.decisive.roots])
-        assert any("small errors" in note for note in found.notes) == (
+        analysis = analyse_linear_loop(scenario, pose=(0.0, 0.0))
+        loops.append([root.s for root in analysis.decisive.roots])
+        assert any("small errors" in note for note in analysis.notes) == (
             law["law"] == "saturated_pd"
         )
     assert loops[0] == loops[1]

@@ -1,6 +1,7 @@
-"""What linear analysis says of a scenario, in Python, in words, and as facts.
+"""The linear analysis of a scenario, in Python, in words, and as facts.
 
-The loop where a recorded run ended: at several rates, over recorded samples, and of laws with waves.
+The loop at the end of a recorded run: at several rates, over recorded samples, and of laws with
+waves.
 """
 
 import json
@@ -33,31 +34,31 @@ def calm() -> LinearAnalysis:
 
 @pytest.fixture(scope="module")
 def digital() -> LinearAnalysis:
-    given = ["scheme=digital", "rate_hz=100", "link.delay_ms=0"]
-    return analyse_linear_loop("paper", given, pose=POSE)
+    settings = ["scheme=digital", "rate_hz=100", "link.delay_ms=0"]
+    return analyse_linear_loop("paper", settings, pose=POSE)
 
 
-def test_above_the_edge_it_is_stable_with_a_margin(calm: LinearAnalysis) -> None:
+def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
     assert calm.verdict == "stable"
     assert calm.continuous.zeros == 2  # a pose that all share, per joint
     assert calm.margin.intervals[0].high_s == pytest.approx(0.23, abs=0.01)
 
 
 def test_less_damping_than_the_edge_is_unstable() -> None:
-    found = analyse_linear_loop("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
-    assert found.verdict == "unstable"
-    assert describe_linear_verdict(found).startswith(
+    analysis = analyse_linear_loop("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
+    assert analysis.verdict == "unstable"
+    assert describe_linear_verdict(analysis).startswith(
         "unstable: the slowest motion goes as exp(0.01"
     )
 
 
-def test_verdict_is_that_of_loop_as_it_is_computed(digital: LinearAnalysis) -> None:
+def test_verdicts_follow_the_computed_loop(digital: LinearAnalysis) -> None:
     assert digital.continuous.verdict == "stable"
     assert digital.verdict == "unstable"
     assert any("the tick rate decides" in note for note in digital.notes)
 
 
-def test_sampled_roots_stand_beside_where_they_differ(
+def test_sampled_roots_stand_beside_differing_ones(
     calm: LinearAnalysis, digital: LinearAnalysis
 ) -> None:
     assert "re as computed" not in tabulate_roots(calm).headers
@@ -68,17 +69,17 @@ def test_sampled_roots_stand_beside_where_they_differ(
 
 
 def test_every_word_has_its_number(calm: LinearAnalysis) -> None:
-    told = calm.to_dict()
-    assert told["verdict"] == "stable"
-    first, *_ = told["continuous"]["roots"]
+    facts = calm.to_dict()
+    assert facts["verdict"] == "stable"
+    first, *_ = facts["continuous"]["roots"]
     assert tuple(tabulate_roots(calm).rows[0][:2]) == (
         f"{first['re_per_s']:.4g}",
         f"{first['im_rad_s']:.4g}",
     )
-    assert told["margin"]["words"] in str(calm)
-    assert str(told["continuous"]["zeros_by_structure"]) in describe_zero_roots(calm)
+    assert facts["margin"]["words"] in str(calm)
+    assert str(facts["continuous"]["zeros_by_structure"]) in describe_zero_roots(calm)
     assert list(describe_equilibrium(calm))[1].strip() == "all sites at (0.0700, 0.2300) rad"
-    json.dumps(told, allow_nan=False)
+    json.dumps(facts, allow_nan=False)
 
 
 def test_the_map_has_every_root_and_its_conjugate(calm: LinearAnalysis) -> None:
@@ -89,40 +90,40 @@ def test_the_map_has_every_root_and_its_conjugate(calm: LinearAnalysis) -> None:
     assert "zero by structure (2)" in lines
 
 
-def test_of_several_rates_the_roots_are_those_over_their_period() -> None:
+def test_several_rates_have_roots_over_periods() -> None:
     """Two sites at 40 and 30 Hz that the continuous loop, at the mean ages, calls stable."""
-    given = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
+    settings = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
     control = {"control": {"law": "p_d", "K": 50.0, "d": 2.0}}
-    pair = load_scenario(load_scenario("two_sites", control), given)
-    found = analyse_linear_loop(pair, pose=(0.0, math.pi))
-    assert (found.continuous.verdict, found.verdict) == ("stable", "unstable")
-    assert describe_linear_verdict(found) == (
+    pair = load_scenario(load_scenario("two_sites", control), settings)
+    analysis = analyse_linear_loop(pair, pose=(0.0, math.pi))
+    assert (analysis.continuous.verdict, analysis.verdict) == ("stable", "unstable")
+    assert describe_linear_verdict(analysis) == (
         "unstable: the slowest motion goes as exp(0.1802 t / s) at 9.955 rad/s, as computed over the period "
         "of 0.1 s"
     )
-    assert any("ticks and delays decide" in note for note in found.notes)
-    assert tabulate_roots(found).rows[0][0] == "0.1802"
-    told = found.to_dict()
-    assert told["as_computed"]["span_s"] == 0.1
-    assert told["as_computed"]["deviation_per_s"] is told["continuous"]["span_s"] is None
+    assert any("ticks and delays decide" in note for note in analysis.notes)
+    assert tabulate_roots(analysis).rows[0][0] == "0.1802"
+    facts = analysis.to_dict()
+    assert facts["as_computed"]["span_s"] == 0.1
+    assert facts["as_computed"]["deviation_per_s"] is facts["continuous"]["span_s"] is None
 
 
-def test_drawn_delays_tell_how_well_their_roots_are_known() -> None:
-    found = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
-    assert found.sampled is not None
-    assert found.sampled.deviation_per_s is not None
-    words = f"over 30 s of the delays in use, +- {found.sampled.deviation_per_s:.1g} /s"
-    assert describe_linear_verdict(found).endswith(words)
-    assert "mean delay in use on m2->m1" in "".join(describe_effective_delays(found))
+def test_drawn_delays_state_their_roots_accuracy() -> None:
+    analysis = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
+    assert analysis.sampled is not None
+    assert analysis.sampled.deviation_per_s is not None
+    phrase = f"over 30 s of the delays in use, +- {analysis.sampled.deviation_per_s:.1g} /s"
+    assert describe_linear_verdict(analysis).endswith(phrase)
+    assert "mean delay in use on m2->m1" in "".join(describe_effective_delays(analysis))
 
 
-def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
-    """Over wave lines with springs, the common speed of two joints; the others decay."""
+def test_lasting_motions_are_separated_from_decaying() -> None:
+    """Over wave lines with springs, the common speed of two joints lasts; the others decay."""
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
-    found = analyse_linear_loop(
+    analysis = analyse_linear_loop(
         "two_sites", {"scheme": "digital", "control": control}, pose=POSE
     )
-    text = describe_linear_verdict(found)
+    text = describe_linear_verdict(analysis)
     assert text.startswith(
         "at the edge: 2 motions keep their speed, and the slowest of the others goes as exp(-0."
     )
@@ -132,24 +133,24 @@ def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
 def test_a_line_without_losses_has_no_margin() -> None:
     """All of its roots are on the axis at any delay; a search for crossings among them would not end."""
     control = {"law": "wave", "b": 60.0, "K": 0.0}
-    given = {"scheme": "digital", "control": control}
-    found = analyse_linear_loop("two_sites", given, pose=POSE, ports=True)
-    assert (found.verdict, found.margin.lossless, found.margin.crossings) == (
+    settings = {"scheme": "digital", "control": control}
+    analysis = analyse_linear_loop("two_sites", settings, pose=POSE, ports=True)
+    assert (analysis.verdict, analysis.margin.lossless, analysis.margin.crossings) == (
         "at the edge",
         True,
         (),
     )
-    assert found.margin.description.startswith("none: waves run along lines without losses")
-    assert found.ports is not None
+    assert analysis.margin.description.startswith("none: waves run along lines without losses")
+    assert analysis.ports is not None
 
 
 @pytest.mark.parametrize("roots", [0, -1, 61])
-def test_a_number_of_roots_that_is_none_is_refused(roots: int) -> None:
+def test_invalid_numbers_of_roots_are_refused(roots: int) -> None:
     with pytest.raises(UsageError, match="roots is a number of roots, 1 to 60"):
         analyse_linear_loop("free", roots=roots)
 
 
-def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
+def test_several_rates_have_exact_scenario_roots() -> None:
     """Both sites end where they start, a millionth apart: folded, as they begin."""
     pair = {
         "sites.m.rate_hz": 40,
@@ -161,32 +162,34 @@ def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
         "sites.m.q0_rad": [0.0, 3.141592],
         "sites.s.q0_rad": [0.0, 3.141593],
     }
-    found = find_log_roots(tn.simulate("two_sites", pair))
-    assert (found.verdict, found.exact) == ("unstable", True)
-    assert found.rate_per_s == pytest.approx(0.180, abs=1e-3)
-    assert found.text.endswith("rad/s, over the period of 0.1 s")
+    roots = find_log_roots(tn.simulate("two_sites", pair))
+    assert (roots.verdict, roots.exact) == ("unstable", True)
+    assert roots.rate_per_s == pytest.approx(0.180, abs=1e-3)
+    assert roots.text.endswith("rad/s, over the period of 0.1 s")
 
 
-def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
-    """Its last quarter begins 15 s later than the draws of the linear analysis: they are others."""
+def test_drawn_delays_use_their_actual_samples() -> None:
+    """Its last quarter begins 15 s later than the draws of the linear analysis, so that the
+    draws differ.
+    """
     run = {"rate_hz": 200, "duration_s": 40.0}
-    found, whole = (
+    roots, whole = (
         find_log_roots(tn.simulate("jitter", run)),
         tn.linear("jitter", run, ports=False),
     )
     assert whole.sampled is not None
     assert whole.sampled.rightmost is not None
-    assert (found.verdict, found.exact) == ("stable", False)
-    assert found.rate_per_s == pytest.approx(whole.sampled.rightmost.s.real, abs=0.01)
-    assert "over 10 s of the delays in use, +- 0.0" in found.text
+    assert (roots.verdict, roots.exact) == ("stable", False)
+    assert roots.rate_per_s == pytest.approx(whole.sampled.rightmost.s.real, abs=0.01)
+    assert "over 10 s of the delays in use, +- 0.0" in roots.text
 
 
-def test_waves_are_told_in_continuous_time() -> None:
+def test_waves_are_analysed_in_continuous_time() -> None:
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
-    found = find_log_roots(
+    roots = find_log_roots(
         tn.simulate("two_sites", {"scheme": "digital", "control": control, "duration_s": 2.0})
     )
-    assert found.text.startswith(
+    assert roots.text.startswith(
         "this rest: at the edge, 2 of its motions keep their speed, the others -0."
     )
-    assert found.text.endswith(", in continuous time")
+    assert roots.text.endswith(", in continuous time")

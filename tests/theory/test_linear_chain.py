@@ -86,24 +86,24 @@ class Linear(NamedTuple):
 
 
 def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
-    """Sites that start at the pose, or off it by (2, 6) rad."""
+    """Returns sites that start at the pose, or off it by (2, 6) rad."""
     start = POSE + (np.zeros((2, 6)) if off is None else off)
-    given = {
+    keys = {
         "control": LAWS[law],
         "sites.m.q0_rad": start[0].tolist(),
         "sites.s.q0_rad": start[1].tolist(),
     }
-    plain = parse_scenario(TEXT, "six", given | overrides, ARMS)
+    plain = parse_scenario(TEXT, "six", keys | overrides, ARMS)
     theta = plain.arms["m"].theta.tolist()
     learns = {"control": {**LAWS[law], "theta_hat0": theta}} if law == "adaptive" else {}
-    scenario = parse_scenario(TEXT, "six", given | overrides | learns, ARMS)
+    scenario = parse_scenario(TEXT, "six", keys | overrides | learns, ARMS)
     return Linear(
         scenario, derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
 
 
 def follow(scenario: Scenario, ticks: int) -> Array:
-    """The angles of both sites at each tick, shape (ticks, 12)."""
+    """Returns the angles of both sites at each tick, shape (ticks, 12)."""
     run, rate_hz = FusedRun(scenario), scenario.sites["m"].rate_hz
     angles = []
     for k in range(1, ticks + 1):
@@ -113,7 +113,7 @@ def follow(scenario: Scenario, ticks: int) -> Array:
 
 
 def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
-    """Accelerations and rates of the estimate as a tick computes them, by the compiled leaves."""
+    """Returns accelerations and rates of the estimate as a tick computes them, by the compiled leaves."""
     assert site.chain is not None
     gains, gravity, q, qd = site.gains, np.array(site.chain.gravity_m_s2), x[at.q], x[at.qd]
     rows = build_chain(site.chain.joints, MAX_JOINTS)
@@ -135,7 +135,7 @@ def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
 
 
 @pytest.mark.long
-def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
+def test_rates_and_derivatives_equal_compiled_leaves() -> None:
     """With hands on the joints and on the end effector, and walls of any direction, one of them touched."""
     rng = np.random.default_rng(14)
     normal = rng.normal(size=3)
@@ -157,8 +157,11 @@ def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
     for _ in range(3):
         x = rng.uniform(-1.0, 1.0, at.arguments)
         rates, exact = evaluate_site_rates(site, x), differentiate_site_rates(site, x)
-        found, wanted = np.concatenate([rates.qdd, rates.estimate]), by_leaves(site, x, at)
-        assert np.abs(found - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
+        derivatives, wanted = (
+            np.concatenate([rates.qdd, rates.estimate]),
+            by_leaves(site, x, at),
+        )
+        assert np.abs(derivatives - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
         jacobian = np.vstack([exact.qdd, exact.estimate])
         for k in range(at.arguments):
             off = 1e-5 * np.eye(at.arguments)[k]
@@ -177,7 +180,7 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
     ]
     assert short.omitted_states == 2 * (60 - len(LOADED)) == len(whole.names) - len(short.names)
     values = [eigvals(set_common_delay(loop, 0.0).A) for loop in (whole, short)]
-    moving = [np.sort_complex(np.round(found[np.abs(found) > 1e-4], 7)) for found in values]
+    moving = [np.sort_complex(np.round(value[np.abs(value) > 1e-4], 7)) for value in values]
     assert len(moving[0]) == len(moving[1])
     assert np.abs(moving[0] - moving[1]).max() <= 1e-6
     w_rad_s = np.array([0.01, 1.0, 13.0, 200.0])
@@ -187,20 +190,22 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
 
 @pytest.mark.long
 def test_no_root_at_zero_hides_the_rightmost_one() -> None:
-    """Of what is left out, each state counts as a root at zero; the shared pose is the others."""
+    """Each omitted state counts as a root at zero; the shared pose gives the others."""
     case = six("adaptive")
     loop = case.loop()
-    found = compute_delay_spectrum(loop, 3)
-    assert (found.zeros, found.drifting) == (loop.omitted_states + 6, 0)
-    assert all(residual(case.loop(all_estimates=True), root.s) <= 1e-12 for root in found.roots)
+    spectrum = compute_delay_spectrum(loop, 3)
+    assert (spectrum.zeros, spectrum.drifting) == (loop.omitted_states + 6, 0)
+    assert all(
+        residual(case.loop(all_estimates=True), root.s) <= 1e-12 for root in spectrum.roots
+    )
     # no other root is to the right of the third
-    edge = found.roots[2].s.real - 0.05
-    right = sum(2 if root.s.imag else 1 for root in found.roots)
+    edge = spectrum.roots[2].s.real - 0.05
+    right = sum(2 if root.s.imag else 1 for root in spectrum.roots)
     assert roots_within(loop, complex(edge, -60.0), complex(20.0, 60.0)) == right + 6
     sampled = compute_sampled_spectrum(case.conditions, case.rest, 3)
     assert sampled is not None
-    assert (sampled.zeros, sampled.drifting) == (found.zeros, 0)
-    for one, other in zip(sampled.roots, found.roots, strict=True):
+    assert (sampled.zeros, sampled.drifting) == (spectrum.zeros, 0)
+    for one, other in zip(sampled.roots, spectrum.roots, strict=True):
         assert abs(one.s - other.s) <= 2e-3 * abs(other.s)
 
 
@@ -208,7 +213,7 @@ OFF = np.array([[1.0, -0.7, 0.5, 0.8, -0.6, 0.9], [-0.8, 0.6, -0.9, 0.3, 0.7, -0
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_run_moves_as_the_delay_equation_says(law: str) -> None:
+def test_a_run_follows_the_delay_equation(law: str) -> None:
     """SciPy's DOP853 by the method of steps, from the same deviation; a run of 1 kHz."""
     small = 1e-6
     case = six(law, small * OFF)
@@ -232,26 +237,28 @@ def test_a_run_moves_as_the_delay_equation_says(law: str) -> None:
         )
         pieces.append(done.sol)
     places = [loop.names.index(f"{site}.q{joint + 1}") for site in "ms" for joint in range(6)]
-    made = follow(case.scenario, 500) - np.tile(POSE, 2)
+    motion_of_run = follow(case.scenario, 500) - np.tile(POSE, 2)
     for k in range(100, 501, 100):
         wanted = pieces[min(1 + (k - 1) // 50, 10)](1e-3 * k)[places]
-        assert np.abs(made[k - 1] - wanted).max() <= 3e-4 * np.abs(wanted).max(), k
+        assert np.abs(motion_of_run[k - 1] - wanted).max() <= 3e-4 * np.abs(wanted).max(), k
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_run_decays_as_its_rightmost_root_says(law: str) -> None:
-    """Late in a run of 200 Hz one mode is left: its root is fitted to joint 2, a recurrence of two steps."""
+def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
+    """Late in a run of 200 Hz one mode remains: its root is fitted to joint 2, a recurrence of
+    two steps.
+    """
     pushed = {
         "sites.m.qd0_rad_s": (1e-3 * OFF[0]).tolist(),
         "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist(),
     }
     case = six(law, rate_hz=200, **pushed)
-    found = compute_sampled_spectrum(case.conditions, case.rest, 2)
-    assert found is not None
-    root, following = (one.s for one in found.roots)
+    spectrum = compute_sampled_spectrum(case.conditions, case.rest, 2)
+    assert spectrum is not None
+    root, following = (root_found.s for root_found in spectrum.roots)
     from_s = 6.0 / (root.real - following.real)  # by then the next mode has a part in 400 left
-    made = follow(case.scenario, round(200 * (from_s + 2.0)))
-    late = np.diff(made[round(200 * from_s) :: 10, 1])
+    motion_of_run = follow(case.scenario, round(200 * (from_s + 2.0)))
+    late = np.diff(motion_of_run[round(200 * from_s) :: 10, 1])
     (a, b), *_ = np.linalg.lstsq(np.column_stack([late[1:-1], late[:-2]]), late[2:], rcond=None)
     z = np.roots([1.0, -a, -b])
     s = np.log(z[np.argmax(z.imag)].astype(complex)) / (10 / 200)
@@ -259,7 +266,7 @@ def test_a_run_decays_as_its_rightmost_root_says(law: str) -> None:
     assert s.imag == pytest.approx(root.imag, rel=3e-4)
 
 
-def test_a_joint_answers_a_sinusoid_as_its_admittance_says() -> None:
+def test_joints_answer_sinusoids_by_their_admittance() -> None:
     """A torque on joint 3 of m in a run of P+d: the motion of all twelve joints."""
     w_rad_s, amplitude_nm, rate_hz, settled_s = 2.0 * np.pi, 0.05, 500, 14.0
     case = six("p_d", rate_hz=rate_hz)
@@ -270,26 +277,26 @@ def test_a_joint_answers_a_sinusoid_as_its_admittance_says() -> None:
     points = np.zeros((len(t_s), 7))
     points[:, 0], points[:, 3] = t_s, amplitude_nm * np.sin(w_rad_s * t_s)
     hands = [{"kind": "recorded", "points": points.tolist()}]
-    made = follow(
+    motion_of_joints = follow(
         six("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario, 18 * rate_hz
     )
-    late = np.arange(round(settled_s * rate_hz), len(made))
+    late = np.arange(round(settled_s * rate_hz), len(motion_of_joints))
     turned = w_rad_s * (late + 1) / rate_hz
     columns = np.column_stack([np.sin(turned), np.cos(turned), np.ones_like(turned), turned])
-    sine, cosine, *_ = np.linalg.lstsq(columns, made[late], rcond=None)[0]
-    found = 1j * w_rad_s * (sine + 1j * cosine) / amplitude_nm
-    assert np.abs(found - Y).max() <= 0.01 * np.abs(Y).max()
+    sine, cosine, *_ = np.linalg.lstsq(columns, motion_of_joints[late], rcond=None)[0]
+    admittance = 1j * w_rad_s * (sine + 1j * cosine) / amplitude_nm
+    assert np.abs(admittance - Y).max() <= 0.01 * np.abs(Y).max()
 
 
-def test_the_law_is_passive_in_r_for_six_joints() -> None:
-    """Also where gravity is learnt, which is not passive in qd at the joints that it loads."""
+def test_six_joint_laws_are_passive_in_r() -> None:
+    """Also with learnt gravity, which is not passive in qd at the joints that it loads."""
     case = six("adaptive")
     ports = analyse_ports(case.scenario, case.rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
     assert ports.proof is not None
     assert ports.proof.passive
-    assert [joint for joint, one in ports.joints.items() if not one.passive] == LOADED
-    assert [one.joint for one in ports.transparency] == [1, 2, 3, 4, 5, 6]
+    assert [joint for joint, port in ports.joints.items() if not port.passive] == LOADED
+    assert [transparency.joint for transparency in ports.transparency] == [1, 2, 3, 4, 5, 6]
     assert len(ports.two_ports) == 6
     assert (
         sum("joint 2, 3, 4, 5, 6: fails within" in line for line in describe_ports(ports)) == 1
@@ -302,15 +309,15 @@ def test_a_pose_has_an_angle_for_each_joint() -> None:
 
 
 @pytest.mark.long
-def test_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
+def test_the_p_d_bound_holds_for_chains() -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2 whatever the arms weigh, if their drives weigh enough for the tick."""
 
     def damped(d: float, **overrides: Any) -> Linear:
         return six("p_d", **{"control.K": 20.0, "control.d": d, **overrides})
 
-    found = evaluate_criterion(damped(1.05).scenario)
-    assert found is not None
-    assert found.excess == pytest.approx(0.1)
+    criterion = evaluate_criterion(damped(1.05).scenario)
+    assert criterion is not None
+    assert criterion.excess == pytest.approx(0.1)
     assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
     edge = next(
         iterate_linear_edges(
@@ -324,10 +331,10 @@ def test_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
 
 
 @pytest.mark.long
-def test_run_that_diverges_has_rest_that_its_start_predicts() -> None:
-    """Of alike arms with alike gains it is near the mean of the start poses."""
+def test_diverging_runs_keep_their_predicted_rest() -> None:
+    """Of alike arms with alike gains the rest is near the mean of the start poses."""
     case = six("adaptive", 0.3 * OFF)
-    found = predict_equilibrium(case.scenario)
-    assert found.residual <= 1e-10
-    assert np.ptp(found.q, axis=0).max() <= 1e-9
-    assert found.q[0] == pytest.approx(np.add(POSE, 0.15 * (OFF[0] + OFF[1])), abs=0.05)
+    equilibrium = predict_equilibrium(case.scenario)
+    assert equilibrium.residual <= 1e-10
+    assert np.ptp(equilibrium.q, axis=0).max() <= 1e-9
+    assert equilibrium.q[0] == pytest.approx(np.add(POSE, 0.15 * (OFF[0] + OFF[1])), abs=0.05)

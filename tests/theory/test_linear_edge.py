@@ -1,6 +1,6 @@
-"""Where stability changes over a key, against the lines of the theory and what they leave out.
+"""Edges of stability over a key, against the lines of the theory and their omissions.
 
-What linear analysis says of the places of a map: the same as it says of each by itself.
+The linear analysis of the places of a map equals that of each place alone.
 """
 
 import math
@@ -31,49 +31,47 @@ from trilat_net.scenario import Scenario, load_scenario
 
 
 def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float:
-    """d where M w^2 = K (1 + share cos w T) and d w = share K sin w T, the largest over M's eigenvalues.
+    """Returns d where M w^2 = K (1 + share cos w T) and d w = share K sin w T, the largest over
+    M's eigenvalues.
 
     The equations of a mode v of M and of an eigenvalue -share of alpha on the imaginary axis.
     """
     rest = predict_equilibrium(scenario)
     theta = scenario.arms["s"].theta
-    found = []
+    dampings = []
     for mass in eigvalsh(np.array(inertia(theta, rest.q[0]))):
 
         def balance(w: float, mass: float = mass) -> float:
             return mass * w * w - K * (1 + share * math.cos(w * T))
 
         w = brentq(balance, 1e-9, math.sqrt(K * (1 + share) / mass))
-        found.append(share * K * math.sin(w * T) / w)
-    return max(found)
+        dampings.append(share * K * math.sin(w * T) / w)
+    return max(dampings)
 
 
 @pytest.mark.parametrize(("name", "share"), [("p_d_margin", 0.5), ("p_d_margin_two", 1.0)])
 @pytest.mark.parametrize(
     "delay_ms", [200.0, *(pytest.param(ms, marks=pytest.mark.long) for ms in (20.0, 400.0))]
 )
-def test_p_d_turns_stable_where_its_mode_stands(
-    name: str, share: float, delay_ms: float
-) -> None:
+def test_p_d_turns_stable_with_its_mode(name: str, share: float, delay_ms: float) -> None:
     scenario = load_scenario(name, {"link.delay_ms": delay_ms})
     T = delay_ms / 1e3
     line = share * 10.0 * T
-    found = next(
+    edge = next(
         iterate_linear_edges(scenario, "control.d", 0.3 * line, 1.5 * line, points=8), None
     )
-    assert found is not None
-    assert found.stable_above
-    assert found.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
-    assert found.value < line  # the line leaves the inertia out: it is on the safe side
+    assert edge is not None
+    assert edge.stable_above
+    assert edge.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
+    assert edge.value < line  # the line leaves the inertia out: it is on the safe side
 
 
 def heavy_pair(
     seed: int, ratio: Callable[[float, float, float, float], float]
 ) -> tuple[Scenario, Array]:
-    """Two sites with random gains and delays whose arms are so heavy that K T^2 << M, and these.
-
-    These: K1, K2, T1 + T2, d1, d2. d2 is that of the line 4 d1 d2 = (T1 + T2)^2 K1 K2; `ratio` says how
-    much heavier the second arm is.
+    """Draws two sites with random gains and delays whose arms are so heavy that K T^2 << M;
+    also returns K1, K2, T1 + T2, d1, d2. d2 is that of the line 4 d1 d2 = (T1 + T2)^2 K1 K2;
+    `ratio` says how much heavier the second arm is.
     """
     rng = np.random.default_rng(seed)
     K1, K2 = (float(K) for K in rng.uniform(2.0, 10.0, 2))
@@ -103,38 +101,38 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
         return (K2 + both * math.sqrt(d2 / d1)) / (K1 + both * math.sqrt(d1 / d2))
 
     scenario, (*_, d2) = heavy_pair(seed, worst)
-    found = next(
+    edge = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3), None
     )
-    assert found is not None
-    assert found.value == pytest.approx(d2, rel=1e-3)
+    assert edge is not None
+    assert edge.value == pytest.approx(d2, rel=1e-3)
 
 
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))]
 )
-def test_two_like_arms_turn_stable_at_their_round_trip(seed: int) -> None:
+def test_two_like_arms_need_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
     scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_, **__: 1.0)
     exact = K1 * (T - d1 / K2)
-    found = next(
+    edge = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3),
         None,
     )
-    assert found is not None
-    assert found.value == pytest.approx(exact, rel=1e-3)
-    assert found.value <= d2 * 1.001
+    assert edge is not None
+    assert edge.value == pytest.approx(exact, rel=1e-3)
+    assert edge.value <= d2 * 1.001
 
 
 @pytest.mark.long
-def test_digital_controller_has_least_rate_where_continuous_loop_has_none() -> None:
+def test_digital_controllers_have_a_least_rate() -> None:
     """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
     scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})
     rest = find_equilibrium(scenario, (-0.1729, 0.0874))
-    found = next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6), None)
-    assert found is not None
-    assert 100 < found.value < 125
-    assert found.stable_above
+    edge = next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6), None)
+    assert edge is not None
+    assert 100 < edge.value < 125
+    assert edge.stable_above
     assert (
         next(
             iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False),
@@ -145,26 +143,26 @@ def test_digital_controller_has_least_rate_where_continuous_loop_has_none() -> N
 
 
 @pytest.mark.long
-def test_every_edge_is_found_and_none_where_nothing_changes() -> None:
+def test_every_existing_edge_is_found() -> None:
     scenario = load_scenario("p_d_margin")
     assert next(iterate_linear_edges(scenario, "control.d", 1.2, 3.0, points=4), None) is None
-    found = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
-    assert [one.stable_above for one in found] == [False, True, False, True][: len(found)]
-    assert all(isinstance(one, LinearEdge) for one in found)
-    assert 200 < found[0].value < 230
+    edges = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
+    assert [edge.stable_above for edge in edges] == [False, True, False, True][: len(edges)]
+    assert all(isinstance(edge, LinearEdge) for edge in edges)
+    assert 200 < edges[0].value < 230
 
 
 @pytest.mark.parametrize(
     ("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))]
 )
-def test_a_range_that_is_none_is_refused(low: float, high: float) -> None:
+def test_an_invalid_range_is_refused(low: float, high: float) -> None:
     with pytest.raises(
         UsageError, match=r"control\.d must be scanned from a lower to a higher value"
     ):
         next(iterate_linear_edges(load_scenario("p_d_margin"), "control.d", low, high), None)
 
 
-def test_a_key_that_is_none_is_refused_with_the_nearest() -> None:
+def test_invalid_keys_are_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'Kd'"):
         next(iterate_linear_edges(load_scenario("p_d_margin"), "control.Kdd", 1, 2), None)
 
@@ -177,9 +175,9 @@ def damped(d: float) -> Scenario:
 
 
 def test_the_real_part_is_that_of_the_analysis() -> None:
-    found, _, remarks = compute_growth_column([damped(d) for d in D], "control.d", D)
+    growth_rates, _, remarks = compute_growth_column([damped(d) for d in D], "control.d", D)
     assert remarks == []
-    for d, growth in zip(D, found, strict=True):
+    for d, growth in zip(D, growth_rates, strict=True):
         root = analyse_linear_loop(
             damped(d), pose=(1.0 / 15.0, 7.0 / 30.0)
         ).continuous.rightmost
@@ -189,40 +187,40 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
 
 @pytest.mark.long
 def test_an_edge_is_where_the_sign_changes() -> None:
-    (found,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
+    (crossing,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
     assert remark == ""
-    places = (found - 1e-4, found + 1e-4)
+    places = (crossing - 1e-4, crossing + 1e-4)
     (below, above), edges, _ = compute_growth_column(
         [*map(damped, places)], "control.d", places
     )
     assert below > 0.0 > above
-    assert edges == {0: pytest.approx(found, rel=1e-6)}
+    assert edges == {0: pytest.approx(crossing, rel=1e-6)}
     alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
     assert alone is not None
-    assert found == pytest.approx(alone.value, rel=1e-6)
+    assert crossing == pytest.approx(alone.value, rel=1e-6)
 
 
-def test_the_scheme_decides_which_loop_counts() -> None:
+def test_the_scheme_decides_the_loop() -> None:
     """Without delay the continuous loop of the paper's law is stable at any rate; as computed it is not."""
     slow: dict[str, Any] = {"link.delay_ms": 0.0, "rate_hz": 50}
     schemes = [
         load_scenario("free", {**slow, "scheme": scheme})
         for scheme in ("second_order", "digital")
     ]
-    found = [compute_growth_column([one], "link.delay_ms", (0.0,)) for one in schemes]
-    (continuous,), (digital,) = (one.growth_per_s for one in found)
+    columns = [compute_growth_column([one], "link.delay_ms", (0.0,)) for one in schemes]
+    (continuous,), (digital,) = (column.growth_per_s for column in columns)
     assert continuous < 0.0 < digital
-    assert found[0].remarks == found[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
+    assert columns[0].remarks == columns[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
 
 
-def test_what_has_no_linear_loop_is_told_and_not_known() -> None:
+def test_nonlinear_loops_are_reported_as_unknown() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
-    found, edges, remarks = compute_growth_column(
+    growth_rates, edges, remarks = compute_growth_column(
         [unknown, damped(3.0)], "control.d", (2.9, 3.0)
     )
     assert edges == {}
-    assert np.isnan(found[0])
-    assert found[1] < 0.0
+    assert np.isnan(growth_rates[0])
+    assert growth_rates[1] < 0.0
     assert len(remarks) == 1
     assert remarks[0].startswith("no linear analysis: ")
     crossings, remark = find_root_crossings(unknown, "control.d", 0.3, 3.0)

@@ -1,4 +1,4 @@
-"""The linear loop against the runs that it is to foretell."""
+"""The linear loop against the runs that it predicts."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ POSE = (-0.1236, 0.3373)
 
 
 def rightmost(overrides: dict[str, float]) -> complex:
-    """Of `free`."""
+    """Returns the rightmost root of `free`."""
     scenario = load_scenario("free", overrides)
     root = compute_delay_spectrum(
         linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario)), 1
@@ -31,23 +31,32 @@ def rightmost(overrides: dict[str, float]) -> complex:
     return root.s
 
 
-def test_states_inputs_and_outputs_are_in_order_of_scenario() -> None:
+def test_states_and_inputs_follow_the_scenarios_order() -> None:
     scenario = load_scenario("contact")
-    found = linearise_loop(
+    linear_loop = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8))
     )
-    assert found.names == ("m.q1", "m.q2", "m.qd1", "m.qd2", "s.q1", "s.q2", "s.qd1", "s.qd2")
-    assert found.inputs == ("m.tau1", "m.tau2", "s.tau1", "s.tau2")
-    assert found.outputs == ("m.qd1", "m.qd2", "s.qd1", "s.qd2")
-    assert found.C @ np.arange(8.0) == pytest.approx([2.0, 3.0, 6.0, 7.0])
-    (delayed,) = found.delayed
+    assert linear_loop.names == (
+        "m.q1",
+        "m.q2",
+        "m.qd1",
+        "m.qd2",
+        "s.q1",
+        "s.q2",
+        "s.qd1",
+        "s.qd2",
+    )
+    assert linear_loop.inputs == ("m.tau1", "m.tau2", "s.tau1", "s.tau2")
+    assert linear_loop.outputs == ("m.qd1", "m.qd2", "s.qd1", "s.qd2")
+    assert linear_loop.C @ np.arange(8.0) == pytest.approx([2.0, 3.0, 6.0, 7.0])
+    (delayed,) = linear_loop.delayed
     assert delayed.delay_s == 0.2
     # k_f = 1: felt as if it were at the hand
-    assert delayed.B[2:4, 2:4] == pytest.approx(found.B[2:4, :2])
+    assert delayed.B[2:4, 2:4] == pytest.approx(linear_loop.B[2:4, :2])
     assert not delayed.B[4:].any()
 
 
-def test_an_adaptive_site_has_its_estimate_among_its_states() -> None:
+def test_adaptive_sites_have_estimates_as_states() -> None:
     scenario = load_scenario("two_sites")
     names = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, (0.1, 0.2))
@@ -63,11 +72,11 @@ def test_an_adaptive_site_has_its_estimate_among_its_states() -> None:
 
 def test_links_of_different_delays_have_an_entry_each() -> None:
     scenario = load_scenario("free", {"links.m1->s.delay_ms": 50.0})
-    found = linearise_loop(
+    linear_loop = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
-    assert [delayed.delay_s for delayed in found.delayed] == [0.05, 0.2]
-    both = found.delayed[0].A + found.delayed[1].A
+    assert [delayed.delay_s for delayed in linear_loop.delayed] == [0.05, 0.2]
+    both = linear_loop.delayed[0].A + linear_loop.delayed[1].A
     alike = linearise_loop(
         derive_operating_conditions(load_scenario("free")),
         find_equilibrium(load_scenario("free"), POSE),
@@ -87,21 +96,22 @@ def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
     assert rightmost({"link.delay_ms": delay_ms, **RODS}).real == pytest.approx(re, abs=2e-3)
 
 
-def test_no_delay_at_all_is_the_limit_of_one_tick() -> None:
+def test_zero_delay_is_the_one_tick_limit() -> None:
     scenario = load_scenario("free", {"link.delay_ms": 0.0})
-    found = linearise_loop(
+    linear_loop = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
     tick, none = (
-        compute_delay_spectrum(set_common_delay(found, T), 1).roots[0].s for T in (1e-3, 0.0)
+        compute_delay_spectrum(set_common_delay(linear_loop, T), 1).roots[0].s
+        for T in (1e-3, 0.0)
     )
-    tenth = compute_delay_spectrum(set_common_delay(found, 1e-4), 1).roots[0].s
+    tenth = compute_delay_spectrum(set_common_delay(linear_loop, 1e-4), 1).roots[0].s
     assert abs(tick - none) < 0.05
     assert abs(tenth - none) == pytest.approx(0.1 * abs(tick - none), rel=0.1)
 
 
 @pytest.mark.long
-def test_a_run_decays_as_its_rightmost_root_says() -> None:
+def test_a_run_decays_at_its_rightmost_root() -> None:
     """Late in a run of P+d two sites swing in one mode; its peaks go as exp(re t), its zeros as im t."""
     scenario = load_scenario("p_d_margin_two", {"duration_s": 120.0, "rate_hz": 200})
     run = trajectories(scenario).sites["m"]
@@ -119,11 +129,11 @@ def test_a_run_decays_as_its_rightmost_root_says() -> None:
 
 
 @pytest.mark.long
-def test_an_unstable_rest_with_wrong_estimates_is_left_for_another() -> None:
+def test_unstable_rests_are_left_for_others() -> None:
     """The theorem says that every run settles, not that every rest is stable.
 
-    The estimates of a run without delay, at 100 ms: a small swing grows as its root says, the estimates move
-    with it, and it dies away.
+    The estimates of a run without delay, at 100 ms: a small swing grows at the rate of its
+    root, the estimates move with it, and it dies away.
     """
     scenario = load_scenario("paper", {"link.delay_ms": 0.0})
     rest = find_equilibrium(scenario)

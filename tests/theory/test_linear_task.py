@@ -1,4 +1,4 @@
-"""The linear loop of sites in task space: against joint space where they are one, and against runs."""
+"""The linear loop of sites in task space: against equivalent loops in joint space, and against runs."""
 
 from typing import Any
 
@@ -82,7 +82,7 @@ HAND = {
 
 
 def cartesian(law: str, space: str) -> Scenario:
-    """Two arms of three sliders, heavier from slider to slider, with an operator who is felt."""
+    """Returns two arms of three sliders, heavier from slider to slider, with an operator who is felt."""
     links = "\n".join(
         SLIDER.format(n=n, mass=3 - 0.5 * n, parent=f"l{n - 1}" if n else "base", axis=axis)
         for n, axis in enumerate(ROWS)
@@ -96,9 +96,9 @@ def cartesian(law: str, space: str) -> Scenario:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_where_task_space_is_joint_space_all_answers_are_one(law: str) -> None:
+def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
     """Of arms that slide along x, y and z the Jacobian is 1: loop, roots, sampled roots, and ports."""
-    found = []
+    loops = []
     for space in ("joints", "position"):
         scenario = cartesian(law, space)
         rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
@@ -109,8 +109,8 @@ def test_where_task_space_is_joint_space_all_answers_are_one(law: str) -> None:
         Y = build_admittance(linearise_teleoperator(conditions, rest))(
             np.array([0.1, 3.0, 40.0])
         )
-        found.append((rest.q, loop, spectrum, sampled, Y))
-    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = found
+        loops.append((rest.q, loop, spectrum, sampled, Y))
+    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = loops
     assert q_task == pytest.approx(q, abs=1e-12)
     assert loop_task.names == loop.names
     assert (other.zeros, other.drifting) == (one.zeros, one.drifting)
@@ -124,7 +124,7 @@ def test_where_task_space_is_joint_space_all_answers_are_one(law: str) -> None:
 
 
 def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> Scenario:
-    """The scenario with its sites at a rest but for deviations of its states, by their names."""
+    """Returns the scenario with its sites at a rest but for deviations of its states, by their names."""
     changes: dict[str, Any] = {}
     for name, q, theta_hat in zip(scenario.names, rest.q, rest.theta_hat, strict=True):
         counts = scenario.arms[name].counts
@@ -146,19 +146,21 @@ def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> 
 
 
 def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
-    """Deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
+    """Returns deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
     run, rows = FusedRun(scenario), []
     for k in range(1, steps + 1):
         run.advance_to(k * step_s)
         rows.append((run.q - rest.q).ravel())
-    made = np.array(rows)
-    return made[:, made.any(axis=0)]
+    motion = np.array(rows)
+    return motion[:, motion.any(axis=0)]
 
 
-def realise(made: Array, step_s: float, order: int) -> Array:
-    """The exponents in a free motion of many signals: Juang and Pappa's eigensystem realisation (1985)."""
-    half = len(made) // 2
-    hankel = np.stack([np.concatenate(made[k : k + half]) for k in range(half)], axis=1)
+def realise(outputs: Array, step_s: float, order: int) -> Array:
+    """Returns the exponents in a free motion of many signals: Juang and Pappa's eigensystem
+    realisation (1985).
+    """
+    half = len(outputs) // 2
+    hankel = np.stack([np.concatenate(outputs[k : k + half]) for k in range(half)], axis=1)
     U, sizes, V = np.linalg.svd(hankel[:, :-1], full_matrices=False)
     U, sizes, V = U[:, :order], np.sqrt(sizes[:order]), V[:order]
     step = (U / sizes).T @ hankel[:, 1:] @ (V / sizes[:, np.newaxis]).T
@@ -166,7 +168,7 @@ def realise(made: Array, step_s: float, order: int) -> Array:
 
 
 def settled(name: str) -> tuple[Scenario, Equilibrium]:
-    """A scenario at the mean of its start poses, with estimates that are true."""
+    """Returns a scenario at the mean of its start poses, with estimates that are true."""
     texts = {"planar": planar_task(), "posed": posed_arms()}
     light = {"control.Kp": 2.0, "control.Gamma": 5.0} if name == "posed" else {}
     scenario = (
@@ -186,8 +188,8 @@ cases = pytest.mark.parametrize(
 
 
 @cases
-def test_small_deviation_goes_tick_by_tick_as_run_does(name: str) -> None:
-    """The companion matrix carries it on; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
+def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
+    """The companion matrix advances the deviation; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
     (scenario, rest), rng, size = settled(name), np.random.default_rng(1), 1e-6
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
     angles = [
@@ -200,27 +202,28 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(name: str) -> None:
     start = np.array([off.get(name, 0.0) for name in names])
     X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // len(late))])
     learnt, torques = (
-        [n for n, one in enumerate(names) if kind in one] for kind in (".gravity", ".tau")
+        [n for n, state_name in enumerate(names) if kind in state_name]
+        for kind in (".gravity", ".tau")
     )
     X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
     X[torques] = (whole @ X)[torques]
-    made = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
+    motion_of_run = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
     places = [names.index(angle) for angle in angles]
-    for row in made:
+    for row in motion_of_run:
         X = whole @ X
         assert np.abs(X[places] - row).max() <= 2e-5 * size
 
 
 @cases
-def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
+def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     """Started along the vector of each of the three rightmost roots that swing."""
     scenario, rest = settled(name)
     conditions = derive_operating_conditions(scenario)
     near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
-    found = compute_sampled_spectrum(conditions, rest, 14)
-    assert found is not None
-    assert found.verdict == near.verdict == "stable"
-    swings = [root.s for root in found.roots if root.s.imag > 0.7 * abs(root.s)][:3]
+    spectrum = compute_sampled_spectrum(conditions, rest, 14)
+    assert spectrum is not None
+    assert spectrum.verdict == near.verdict == "stable"
+    swings = [root.s for root in spectrum.roots if root.s.imag > 0.7 * abs(root.s)][:3]
     assert swings
     loop = linearise_loop(conditions, rest, all_estimates=True)
     pencil, names, _ = find_moving_part(loop)
@@ -236,8 +239,8 @@ def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
 
 
 @cases
-def test_the_law_is_passive_in_r_at_the_end_effectors(name: str) -> None:
-    """Of places, also with axes left open and with joints to spare; of poses there is no proof."""
+def test_the_law_is_passive_at_end_effectors(name: str) -> None:
+    """Of places, also with axes left open and with redundant joints; of poses there is no proof."""
     scenario, rest = settled(name)
     ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
@@ -250,19 +253,23 @@ def test_the_law_is_passive_in_r_at_the_end_effectors(name: str) -> None:
     assert ("N s/m", "N m s/rad" in text) == ("N s/m", name == "posed")
 
 
-def test_edges_margins_and_verdict_are_those_of_one_loop() -> None:
-    """P+d in task space: the margin's frequency is a root, and the edge of d is where the verdict changes."""
+def test_edges_margins_and_verdict_share_one_loop() -> None:
+    """P+d in task space: the margin's frequency is a root, and the edge of d is where the
+    verdict changes.
+    """
     law = {"law": "p_d", "K": 120.0, "d": 12.0}
     scenario = parse_scenario(planar_task(), "planar", {"control": law})
     pose = find_mean_pose(scenario)
-    found = analyse_linear_loop(scenario, pose=pose)
-    end = found.margin.intervals[0].high
+    analysis = analyse_linear_loop(scenario, pose=pose)
+    end = analysis.margin.intervals[0].high
     assert end is not None
-    there = compute_delay_spectrum(set_common_delay(found.loop, end.delay_s), 1).rightmost
-    assert there is not None
-    assert there.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
+    rightmost = compute_delay_spectrum(
+        set_common_delay(analysis.loop, end.delay_s), 1
+    ).rightmost
+    assert rightmost is not None
+    assert rightmost.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
     edge = next(
-        iterate_linear_edges(scenario, "control.d", 2.0, 20.0, found.rest, points=5), None
+        iterate_linear_edges(scenario, "control.d", 2.0, 20.0, analysis.rest, points=5), None
     )
     assert edge is not None
     for d, verdict in ((0.99 * edge.value, "unstable"), (1.01 * edge.value, "stable")):
@@ -270,7 +277,7 @@ def test_edges_margins_and_verdict_are_those_of_one_loop() -> None:
         assert analyse_linear_loop(beside, pose=pose, roots=1).continuous.verdict == verdict
 
 
-def test_poses_that_have_no_loop_are_refused_by_name() -> None:
+def test_poses_without_loop_are_refused_by_name() -> None:
     scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 1e-6})
     with pytest.raises(ScenarioError, match="rests in a singular pose") as refused:
         find_equilibrium(scenario, (2.0, 0.0, 0.0))
@@ -283,7 +290,7 @@ def test_poses_that_have_no_loop_are_refused_by_name() -> None:
         find_equilibrium(scenario, (2.5, 0.0))
 
 
-def test_rest_near_singular_pose_has_its_damping_in_loop() -> None:
+def test_rests_near_singular_poses_include_damping() -> None:
     scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 0.9})
-    found = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
-    assert any("rests near a singular pose" in note for note in found.notes)
+    analysis = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
+    assert any("rests near a singular pose" in note for note in analysis.notes)

@@ -48,7 +48,7 @@ def pair(**overrides: Any) -> Scenario:
 
 
 def looped_trace(folder: Path, period_s: float) -> dict[str, Any]:
-    """Delays of 60 ms, and of 400 ms in the last tenth of the period."""
+    """Returns delays of 60 ms, and of 400 ms in the last tenth of the period."""
     times_s = np.arange(0.0, period_s, 0.01)
     delays_ms = np.where(times_s < 0.9 * period_s, 60.0, 400.0)
     rows = [f"{t:.2f},{delay:.3f}" for t, delay in zip(times_s, delays_ms, strict=True)]
@@ -57,7 +57,8 @@ def looped_trace(folder: Path, period_s: float) -> dict[str, Any]:
 
 
 def measure_growth(scenario: Scenario, until_s: float) -> float:
-    """Growth of the logarithm of the largest |qd| per second, over the last 3/4 of a long run.
+    """Returns the growth of the logarithm of the largest |qd| per second, over the last 3/4 of
+    a long run.
 
     A least-squares line through the maxima of 1 s averages over the beat between the motion and
     the period of the delays.
@@ -104,7 +105,7 @@ def test_random_delays_have_no_period(link: dict[str, Any]) -> None:
     assert find_final_delay_period(pair(link=link)).true_s is None
 
 
-def test_mean_time_between_bursts_is_that_of_the_losses() -> None:
+def test_bursts_are_spaced_by_their_losses() -> None:
     """Bursts of 20 samples that lose one sample in five begin every 100 samples."""
     rng = np.random.default_rng(4)
     for burst, loss, share in ((20.0, 0.2, 1.0), (8.0, 0.1, 0.95)):
@@ -129,8 +130,8 @@ def test_mean_time_between_bursts_is_that_of_the_losses() -> None:
     assert find_burst_interval_s(pair()) is None
 
 
-def test_two_sinusoids_have_the_growth_of_their_common_period() -> None:
-    """0.6 s and 0.7 s repeat after 4.2 s; one more second of delay swings the pair up."""
+def test_two_sinusoids_grow_over_their_common_period() -> None:
+    """0.6 s and 0.7 s repeat after 4.2 s; one more second of delay makes the pair grow."""
     links = {"links.m->s": sine(0.6), "links.s->m": sine(0.7)}
     scenario = pair(**{"control.d": 1.2, "duration_s": 20.0, **links})
     roots = find_log_roots(tn.simulate(scenario))
@@ -141,7 +142,7 @@ def test_two_sinusoids_have_the_growth_of_their_common_period() -> None:
 
 @pytest.mark.parametrize("d", [0.75, 1.3])
 def test_looped_trace_is_decided_over_its_period(d: float, tmp_path: Path) -> None:
-    """A run of 1.4 periods shows neither; the record of one period repeats for ever."""
+    """A run of 1.4 periods does not decide; the record of one period repeats for ever."""
     link = looped_trace(tmp_path, 10.0)
     scenario = pair(**{"control.d": d, "duration_s": 14.0, "link": link})
     certificate = certify_run(tn.simulate(scenario))
@@ -190,7 +191,7 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     assert certify_run(log).decision == certify_run(plain).decision
 
 
-def test_roots_are_of_the_loop_after_the_last_command() -> None:
+def test_roots_follow_the_last_command() -> None:
     scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
     log = simulate_with_commands(scenario, "s", (3.0, SLOWER))
     final = resolve_final_scenario(log)
@@ -204,7 +205,7 @@ def test_roots_are_of_the_loop_after_the_last_command() -> None:
     assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)
 
 
-def test_a_run_shorter_than_a_trace_has_the_roots_of_the_whole_trace(tmp_path: Path) -> None:
+def test_short_runs_have_the_whole_traces_roots(tmp_path: Path) -> None:
     """The delays are constant in the run, and long in the last tenth of the period."""
     link = looped_trace(tmp_path, 20.0)
     short, whole = (
@@ -215,7 +216,7 @@ def test_a_run_shorter_than_a_trace_has_the_roots_of_the_whole_trace(tmp_path: P
     assert short.rate_per_s == pytest.approx(whole.rate_per_s, rel=0.02)
 
 
-def test_the_theorem_proves_nothing_for_delays_that_change_after_the_run(
+def test_theorems_prove_nothing_for_later_delay_changes(
     tmp_path: Path,
 ) -> None:
     link = looped_trace(tmp_path, 60.0)

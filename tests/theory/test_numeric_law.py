@@ -1,4 +1,6 @@
-"""Laws of one's own, linearised by differences: their roots are those of built-in laws that they repeat."""
+"""Users' own laws, linearised by differences: their roots are those of the built-in laws that
+they repeat.
+"""
 
 from typing import Any
 
@@ -27,13 +29,13 @@ def linear(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
     )
 
 
-def roots(found: Spectrum) -> Array:
-    return np.array([one.s for one in found.roots])
+def roots(spectrum: Spectrum) -> Array:
+    return np.array([root.s for root in spectrum.roots])
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("law", [PD, PeerPD])
-def test_p_d_of_ones_own_has_roots_of_p_d(law: type, scheme: str) -> None:
+def test_own_p_d_has_p_d_roots(law: type, scheme: str) -> None:
     ours, theirs = linear("p_d", scheme=scheme), linear(law, scheme=scheme)
     assert ours.sampled is not None
     assert theirs.sampled is not None
@@ -49,7 +51,7 @@ def test_p_d_of_ones_own_has_roots_of_p_d(law: type, scheme: str) -> None:
 
 
 def test_forces_are_those_of_the_four_channel_law() -> None:
-    """Of the peers, in sum and each by itself, and of its own arm: with an operator at a master."""
+    """Of the peers, as a sum and separately, and of its own arm: with an operator at a master."""
     hand = [{**CLAMP, "to_rad": list(POSE), "stiffness_nm_rad": 40.0, "damping_nm_s_rad": 5.0}]
     held: dict[str, Any] = {"sites.m1.hands": hand, "link.delay_ms": 30.0}
     ours = linear("four_channel", gains={"K": 100.0, "B": 20.0, "force_own": 0.5}, **held)
@@ -60,12 +62,12 @@ def test_forces_are_those_of_the_four_channel_law() -> None:
         )
 
 
-def test_the_tick_before_is_memory_like_any_other() -> None:
-    kept, remembered = linear(Backward), linear(Remembering)
-    assert kept.sampled is not None
+def test_the_last_tick_is_memory() -> None:
+    analysis, remembered = linear(Backward), linear(Remembering)
+    assert analysis.sampled is not None
     assert remembered.sampled is not None
-    assert np.allclose(roots(kept.sampled), roots(remembered.sampled), rtol=0.0, atol=1e-6)
-    late, exact = roots(kept.sampled)[0], roots(linear("p_d").decisive)[0]
+    assert np.allclose(roots(analysis.sampled), roots(remembered.sampled), rtol=0.0, atol=1e-6)
+    late, exact = roots(analysis.sampled)[0], roots(linear("p_d").decisive)[0]
     assert 1e-4 < abs(late - exact) < 1e-2, "half a tick of delay in the damping"
 
 
@@ -79,37 +81,39 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     rest = find_equilibrium(ours, POSE)
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
-    found = roots(compute_sampled_spectrum(derive_operating_conditions(theirs), same))
+    roots_of_memory = roots(compute_sampled_spectrum(derive_operating_conditions(theirs), same))
     known = roots(compute_sampled_spectrum(derive_operating_conditions(ours), rest))
     same_bits = scheme == "second_order"
-    assert np.allclose(found[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2)
+    assert np.allclose(
+        roots_of_memory[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2
+    )
 
 
-def test_what_is_not_linearised_is_refused() -> None:
+def test_unlinearised_features_are_refused() -> None:
     with pytest.raises(ScenarioError, match="sends vectors that the law defines"):
         linear(Line)
 
 
 def test_a_certificate_runs_no_code_from_outside() -> None:
     log = tn.simulate("two_sites", {"control.law": PD}, duration_s=0.1)
-    found = tn.certify(log).roots
-    assert found is not None
-    assert "known by its code only" in found.text
+    loop_roots = tn.certify(log).roots
+    assert loop_roots is not None
+    assert "known by its code only" in loop_roots.text
 
 
 @pytest.mark.long
-def test_a_run_decays_as_its_roots_say() -> None:
-    """From the poses of its sites to rest, and its edge lies where that of p_d does."""
-    own = tn.linear(
+def test_a_run_decays_at_its_roots() -> None:
+    """From the poses of its sites to rest, and its edge lies at that of p_d."""
+    analysis = tn.linear(
         "p_d_margin",
         {"control.law": CompiledPD, "control.d": 1.5},
         over=["control.d=0.3:3"],
         ports=True,
     )
     built_in = tn.linear("p_d_margin", {"control.d": 1.5}, over=["control.d=0.3:3"], ports=True)
-    assert own.scans[0].edges[0].value == pytest.approx(
+    assert analysis.scans[0].edges[0].value == pytest.approx(
         built_in.scans[0].edges[0].value, rel=1e-5
     )
-    assert np.allclose(own.rest.q, built_in.rest.q, atol=1e-5)
-    assert own.ports is not None
-    assert own.ports.verdict == "stable"
+    assert np.allclose(analysis.rest.q, built_in.rest.q, atol=1e-5)
+    assert analysis.ports is not None
+    assert analysis.ports.verdict == "stable"

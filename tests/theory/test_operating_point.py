@@ -1,6 +1,6 @@
-"""What holds at the end of a run, and what has no linear loop.
+"""The operating point at the end of a run, and loops without linear form.
 
-How old samples are when they are used: by the rule of the links, and as a run says.
+The age of samples in use: by the rule of the links, and by a run.
 """
 
 import numpy as np
@@ -19,18 +19,20 @@ from trilat_net.scenario import Scenario, load_scenario
 
 
 def test_shares_and_links_are_those_at_the_end() -> None:
-    found = derive_operating_conditions(load_scenario("training"))
-    assert found.alpha.sum(axis=1) == pytest.approx(1.0)
-    row = dict(zip(found.names, found.alpha[found.names.index("s")], strict=True))
+    conditions = derive_operating_conditions(load_scenario("training"))
+    assert conditions.alpha.sum(axis=1) == pytest.approx(1.0)
+    row = dict(
+        zip(conditions.names, conditions.alpha[conditions.names.index("s")], strict=True)
+    )
     assert row["m1"] == pytest.approx(0.1)
     assert any(
-        "the dominance factors of s change during the run" in note for note in found.notes
+        "the dominance factors of s change during the run" in note for note in conditions.notes
     )
     half = derive_operating_conditions(load_scenario("training", {"duration_s": 11.0}))
     assert half.alpha[half.names.index("s"), 0] == pytest.approx(0.5)
 
 
-def test_only_hands_that_hold_are_in_the_operating_point() -> None:
+def test_only_holding_hands_enter_operating_points() -> None:
     assert not any(
         site.actors for site in derive_operating_conditions(load_scenario("paper")).sites
     )
@@ -43,23 +45,23 @@ def test_only_hands_that_hold_are_in_the_operating_point() -> None:
     assert any("still moves at the end" in note for note in moving.notes)
 
 
-def test_two_recorded_torques_stay_and_a_swinging_one_is_omitted() -> None:
+def test_only_constant_recorded_torques_stay() -> None:
     recorded = [
         {"kind": "recorded", "points": [[0.0, push, 0.0], [60.0, push, 0.0]]}
         for push in (1.0, 2.0)
     ]
     swings = {"kind": "multisine", "amplitude_nm": [1.0, 0.0], "frequencies_hz": [1.0]}
     scenario = load_scenario("free", {"sites.m1.hands": [*recorded, swings]})
-    found = derive_operating_conditions(scenario)
-    assert [actor.a for actor in found.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
-    assert any("still swings at the end" in note for note in found.notes)
+    conditions = derive_operating_conditions(scenario)
+    assert [actor.a for actor in conditions.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
+    assert any("still swings at the end" in note for note in conditions.notes)
     assert len(extend_scenario(scenario, 100.0).sites["m1"].hands) == 2
 
 
-def test_what_varies_is_said_with_its_mean() -> None:
-    found = derive_operating_conditions(load_scenario("jitter", {"duration_s": 5.0}))
-    assert found.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
-    assert any("linearised at the mean of each" in note for note in found.notes)
+def test_varying_quantities_have_their_mean() -> None:
+    conditions = derive_operating_conditions(load_scenario("jitter", {"duration_s": 5.0}))
+    assert conditions.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
+    assert any("linearised at the mean of each" in note for note in conditions.notes)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +75,7 @@ def test_what_varies_is_said_with_its_mean() -> None:
         ),
     ],
 )
-def test_what_has_no_linear_loop_is_refused(
+def test_loops_without_linear_form_are_refused(
     overrides: dict[str, object], facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as refused:
@@ -81,14 +83,14 @@ def test_what_has_no_linear_loop_is_refused(
     assert all(fact in str(refused.value) for fact in ["two_sites", *facts])
 
 
-def test_a_run_that_goes_on_has_nothing_new_in_it() -> None:
+def test_continuing_runs_change_nothing() -> None:
     longer = extend_scenario(load_scenario("training", {"duration_s": 5.0}), 50.0)
     assert longer.duration_s == 50.0
     assert longer.timeline == ()
-    held = derive_operating_conditions(longer)
-    assert [len(site.actors) for site in held.sites] == [1, 1, 0]
+    conditions = derive_operating_conditions(longer)
+    assert [len(site.actors) for site in conditions.sites] == [1, 1, 0]
     assert np.array_equal(
-        held.alpha,
+        conditions.alpha,
         derive_operating_conditions(load_scenario("training", {"duration_s": 5.0})).alpha,
     )
 
@@ -101,7 +103,7 @@ def scenario(**link: object) -> Scenario:
 
 
 @given(delay_ms=st.floats(0, 500), rate_hz=st.sampled_from([100, 300, 1000]))
-def test_constant_delay_is_in_use_from_next_tick_on(delay_ms: float, rate_hz: int) -> None:
+def test_constant_delay_is_used_from_next_tick(delay_ms: float, rate_hz: int) -> None:
     chosen = load_scenario("two_sites", {"link.delay_ms": delay_ms, "rate_hz": rate_hz})
     age = compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])
     ticks = age.mean_s * rate_hz

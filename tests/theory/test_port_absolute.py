@@ -22,13 +22,13 @@ POSITIVE = st.floats(0.1, 10.0)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def drawn(seed: int, ports: int, count: int = 40) -> Complex:
-    """Networks about the edge of absolute stability, off-diagonal entries of very different size."""
+def draw_networks(seed: int, ports: int, count: int = 40) -> Complex:
+    """Draws networks about the edge of absolute stability, off-diagonal entries of very different size."""
     rng = np.random.default_rng(seed)
     Y = rng.normal(size=(count, ports, ports)) + 1j * rng.normal(size=(count, ports, ports))
     Y *= 10.0 ** rng.uniform(-1.0, 1.0, size=(count, 1, ports)) * rng.uniform(0.1, 0.6)
-    own = np.arange(ports)
-    Y[:, own, own] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(
+    own_ports = np.arange(ports)
+    Y[:, own_ports, own_ports] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(
         size=(count, ports)
     )
     return np.asarray(Y, dtype=np.complex128)
@@ -36,14 +36,14 @@ def drawn(seed: int, ports: int, count: int = 40) -> Complex:
 
 @settings(max_examples=20, deadline=None)
 @given(K=POSITIVE, B=POSITIVE, d=st.just(0.0) | POSITIVE)
-def test_springs_and_dampers_between_two_sites_hold_without_a_delay(
+def test_undelayed_springs_and_dampers_are_absolutely_stable(
     K: float, B: float, d: float
 ) -> None:
     assert not criterion(pair((K, K), (d, d), (0.0, 0.0), B)).below
 
 
 @pytest.mark.parametrize("d", [0.4, 1.0, 1.6])
-def test_with_a_delay_p_d_fails_below_its_sine(d: float) -> None:
+def test_delayed_p_d_fails_below_its_sine(d: float) -> None:
     """2 d^2 >= abs(z12 z21) + Re(z12 z21) = 2 K^2 sin^2(w T) / w^2."""
     edge_rad_s = brentq(lambda w: 10.0 * np.sin(0.2 * w) / w - d, 1e-6, np.pi / 0.2)
     (span,) = criterion(pair(d=(d, d))).below[:1]
@@ -53,8 +53,8 @@ def test_with_a_delay_p_d_fails_below_its_sine(d: float) -> None:
 
 
 @given(seed=SEEDS)
-def test_the_criterion_is_its_three_inequalities_in_both_forms(seed: int) -> None:
-    Y = drawn(seed, 2)
+def test_the_criterion_equals_its_three_inequalities(seed: int) -> None:
+    Y = draw_networks(seed, 2)
     Y[::3, 0, 0] -= 0.4
     for parameters in (Y, np.linalg.inv(Y)):
         a, b, through = (
@@ -68,32 +68,34 @@ def test_the_criterion_is_its_three_inequalities_in_both_forms(seed: int) -> Non
         np.testing.assert_array_equal((llewellyn_parameter(Y) >= 1.0)[clear], holds[clear])
 
 
-def test_the_parameter_is_minus_one_at_most_with_active_ports() -> None:
+def test_llewellyns_parameter_is_at_most_minus_one() -> None:
     Y = np.array([[[1.0, 0.0], [5.0, 1.0]], [[-1.0, 0.1], [0.1, -1.0]]], dtype=np.complex128)
     np.testing.assert_array_equal(llewellyn_parameter(Y), [MAX_LLEWELLYN, -1.0])
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS)
-def test_for_two_ports_the_best_weights_decide_as_llewellyn_does(seed: int) -> None:
-    Y = drawn(seed, 2)
-    found = find_best_weights(Y, np.array([0, 1]))
+def test_for_two_ports_weights_match_llewellyn(seed: int) -> None:
+    Y = draw_networks(seed, 2)
+    weights = find_best_weights(Y, np.array([0, 1]))
     parameter = llewellyn_parameter(Y)
-    clear = np.abs(found.margin) > 1e-4
-    np.testing.assert_array_equal(found.margin[clear] > 0.0, parameter[clear] > 1.0)
+    clear = np.abs(weights.margin) > 1e-4
+    np.testing.assert_array_equal(weights.margin[clear] > 0.0, parameter[clear] > 1.0)
     # where both parts are alike: y12 beta_1 ~ y21 beta_2
     ratio = np.abs(Y[:, 0, 1]) / np.abs(Y[:, 1, 0])
-    np.testing.assert_allclose(found.weights[:, 0], 1.0)
-    plain = find_least_eigenvalue(weight_response(Y, found.weights))
-    np.testing.assert_array_equal(plain[clear] > 0.0, found.margin[clear] > 0.0)
+    np.testing.assert_allclose(weights.weights[:, 0], 1.0)
+    plain = find_least_eigenvalue(weight_response(Y, weights.weights))
+    np.testing.assert_array_equal(plain[clear] > 0.0, weights.margin[clear] > 0.0)
     assert np.isfinite(ratio).all()
 
 
 def destabilised(Y: Complex) -> NDArray[np.bool_]:
-    """Whether passive impedances at the ports make det(1 + Y diag(z)) zero: two lossless, one solved for."""
+    """True if passive impedances at the ports make det(1 + Y diag(z)) zero: two lossless, one
+    solved for.
+    """
     x = np.tan(np.linspace(-0.499 * np.pi, 0.499 * np.pi, 301))
     z1, z2 = (1j * part for part in np.meshgrid(x, x))
-    found = np.zeros(len(Y), dtype=bool)
+    is_destabilised = np.zeros(len(Y), dtype=bool)
     for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         for n, y in enumerate(Y[:, order][:, :, order]):
             a, b = 1.0 + y[0, 0] * z1, 1.0 + y[1, 1] * z2
@@ -103,15 +105,17 @@ def destabilised(Y: Complex) -> NDArray[np.bool_]:
                 - y[0, 2] * (y[2, 0] * z1 * b - y[2, 1] * z2 * y[1, 0] * z1)
                 + y[1, 2] * (y[2, 0] * z1 * y[0, 1] * z2 - y[2, 1] * z2 * a)
             )
-            found[n] |= bool((-(without / with_third).real > 0.0).any())
-    return found
+            is_destabilised[n] |= bool((-(without / with_third).real > 0.0).any())
+    return is_destabilised
 
 
 @settings(max_examples=4, deadline=None)
 @given(seed=SEEDS)
-def test_for_three_ports_the_weights_fail_at_passive_hands_poles(seed: int) -> None:
-    """Necessary and sufficient: a search among passive loads finds one where and only where no weights do."""
-    Y = drawn(seed, 3)
+def test_for_three_ports_weights_are_exact(seed: int) -> None:
+    """Necessary and sufficient: a search among passive loads finds one where and only where no
+    weights do.
+    """
+    Y = draw_networks(seed, 3)
     margin = find_best_weights(Y, np.array([0, 1, 2])).margin
     clear = np.abs(margin) > 0.05
     np.testing.assert_array_equal(destabilised(Y[clear]), margin[clear] < 0.0)
@@ -120,9 +124,9 @@ def test_for_three_ports_the_weights_fail_at_passive_hands_poles(seed: int) -> N
 @settings(max_examples=10, deadline=None)
 @given(seed=SEEDS)
 def test_no_weights_of_a_fine_grid_do_better(seed: int) -> None:
-    Y = drawn(seed, 6, count=3)
+    Y = draw_networks(seed, 6, count=3)
     owner = np.array([0, 0, 1, 1, 2, 2])
-    found = find_best_weights(Y, owner)
+    weights = find_best_weights(Y, owner)
     size = np.ones((3, 6))
     for site in range(3):
         part = Y[:, owner == site][:, :, owner == site]
@@ -139,7 +143,7 @@ def test_no_weights_of_a_fine_grid_do_better(seed: int) -> None:
         ],
         axis=0,
     )
-    assert (found.margin >= best - 2e-3 * np.abs(found.margin)).all()
+    assert (weights.margin >= best - 2e-3 * np.abs(weights.margin)).all()
 
 
 def test_one_site_needs_no_weights() -> None:
@@ -148,9 +152,9 @@ def test_one_site_needs_no_weights() -> None:
 
 
 @given(seed=SEEDS)
-def test_what_remains_of_ports_is_part_of_a_matrix(seed: int) -> None:
-    """Hands off: rows and columns of Y fall away. Clamped: those of Z."""
-    Y = drawn(seed, 3)
+def test_remaining_ports_are_part_of_matrices(seed: int) -> None:
+    """Free: rows and columns of Y fall away. Clamped: those of Z."""
+    Y = draw_networks(seed, 3)
     np.testing.assert_array_equal(clamp_ports(Y, [0, 2], []), Y[:, [0, 2]][:, :, [0, 2]])
     Z = np.linalg.inv(Y)
     np.testing.assert_allclose(

@@ -12,40 +12,44 @@ from trilat_net.scenario import load_scenario
 
 @pytest.mark.parametrize("name", ["p_d_margin_two", "p_d_margin"])
 @pytest.mark.parametrize("K", [5.0, 20.0])
-def test_p_d_is_passive_from_line_of_its_stability_on(name: str, K: float) -> None:
+def test_p_d_is_passive_once_stable(name: str, K: float) -> None:
     """d = abs(lambda_min(alpha)) K T, whatever the masses, and with joints that are coupled."""
     line = {"p_d_margin_two": 1.0, "p_d_margin": 0.5}[name] * K * 0.2
     beyond = section_of(name, (("control.K", K), ("control.d", 1.02 * line)))
     assert beyond.velocity.passive
     assert beyond.pole.passive
     assert not beyond.absolute.below
-    assert not any(one.minima.below for one in beyond.two_ports)
+    assert not any(two_port.minima.below for two_port in beyond.two_ports)
     below = section_of(name, (("control.K", K), ("control.d", 0.98 * line)))
     assert not below.velocity.passive
     assert below.absolute.below
-    assert all(one.minima.below for one in below.two_ports if len(below.sites) == 2)
+    assert all(two_port.minima.below for two_port in below.two_ports if len(below.sites) == 2)
 
 
 @pytest.mark.long
-def test_every_criterion_agrees_where_a_port_is_left_alone() -> None:
-    """What is passive is absolutely stable, and what is so at all joints is so at each."""
+def test_criteria_agree_for_single_ports() -> None:
+    """A passive port is absolutely stable, and a network stable at all joints is so at each."""
     bare = (("timeline", ()), ("sites.m1.hands", ()), ("sites.m2.hands", ()))
     for name, overrides in (("p_d_margin", ()), ("training", bare), ("two_sites", ())):
         section = section_of(name, overrides)
         assert section.verdict == "stable"
-        fails = [one for one in section.two_ports if one.minima.below and not one.clamped]
+        fails = [
+            two_port
+            for two_port in section.two_ports
+            if two_port.minima.below and not two_port.clamped
+        ]
         if not section.absolute.below:
             assert not fails
         if section.velocity.passive:
             assert not section.absolute.below
-            assert all(one.passive for one in section.joints.values())
+            assert all(joint.passive for joint in section.joints.values())
         worst = max((span.to_hz for span in section.velocity.minima.below), default=0.0)
         assert all(span.to_hz <= worst * 1.001 for span in section.absolute.below)
 
 
-def test_three_sites_pair_with_the_third_off_and_clamped() -> None:
+def test_three_sites_pair_with_the_third_free() -> None:
     three = section_of("p_d_margin")
-    assert [(one.sites, one.clamped) for one in three.two_ports[::2]] == [
+    assert [(two_port.sites, two_port.clamped) for two_port in three.two_ports[::2]] == [
         (("m1", "m2"), ""),
         (("m1", "m2"), "s"),
         (("m1", "s"), ""),
@@ -53,16 +57,17 @@ def test_three_sites_pair_with_the_third_off_and_clamped() -> None:
         (("m2", "s"), ""),
         (("m2", "s"), "m1"),
     ]
-    assert {one.joint for one in three.two_ports} == {1, 2}
-    assert [(one.sites, one.clamped) for one in section_of("p_d_margin_two").two_ports] == 2 * [
-        (("m", "s"), "")
-    ]
-
-
-def test_hands_feel_the_slave_unless_another_site_is_named() -> None:
+    assert {two_port.joint for two_port in three.two_ports} == {1, 2}
     assert [
-        (one.operator_site, one.other_site, one.joint)
-        for one in section_of("p_d_margin").transparency
+        (two_port.sites, two_port.clamped)
+        for two_port in section_of("p_d_margin_two").two_ports
+    ] == 2 * [(("m", "s"), "")]
+
+
+def test_hands_feel_the_slave_by_default() -> None:
+    assert [
+        (transparency.operator_site, transparency.other_site, transparency.joint)
+        for transparency in section_of("p_d_margin").transparency
     ] == [
         ("m1", "s", 1),
         ("m1", "s", 2),
@@ -70,8 +75,8 @@ def test_hands_feel_the_slave_unless_another_site_is_named() -> None:
         ("m2", "s", 2),
     ]
     assert {
-        (one.operator_site, one.other_site)
-        for one in section_of("p_d_margin", of="m1").transparency
+        (transparency.operator_site, transparency.other_site)
+        for transparency in section_of("p_d_margin", of="m1").transparency
     } == {
         ("m2", "m1"),
         ("s", "m1"),
@@ -92,7 +97,7 @@ def test_only_the_paper_s_law_has_an_r() -> None:
     assert section_of("p_d_margin").proof is None
 
 
-def test_wrong_estimates_let_the_linear_loop_return_stored_energy() -> None:
+def test_wrong_estimates_return_stored_energy() -> None:
     """V counts the error of the estimates, which of inertia nothing excites to first order."""
     scenario = load_scenario("free")
     rest = find_equilibrium(scenario, POSE)
@@ -105,8 +110,10 @@ def test_wrong_estimates_let_the_linear_loop_return_stored_energy() -> None:
     assert not section.proof.passive
 
 
-def test_force_that_is_reflected_late_is_unstable_against_a_clamp() -> None:
-    """A master with k_f = 1 meets a slave that cannot move: K e^{-2 s T} about an arm with little damping."""
+def test_late_reflected_force_is_unstable_when_clamped() -> None:
+    """A master with k_f = 1 meets a slave that cannot move: K e^{-2 s T} about an arm with
+    little damping.
+    """
     bare = (("sites.m.hands", ()), ("sites.s.environment", ()))
     assert section_of("contact", bare).clamped_verdict == "unstable"
     near = (*bare, ("link.delay_ms", 1.0), ("sites.m.control.d", 30.0))
@@ -115,13 +122,13 @@ def test_force_that_is_reflected_late_is_unstable_against_a_clamp() -> None:
     assert section.transparency[0].ratio_db > 2.0
 
 
-def test_one_way_networks_have_no_damping_for_all_weights() -> None:
+def test_one_way_networks_lack_damping() -> None:
     section = section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ())))
     assert not section.velocity.passive
     assert 0.0 < section.velocity.lacking_nm_s_rad < math.inf
 
 
-def test_what_cannot_be_asked_is_refused() -> None:
+def test_impossible_questions_are_refused() -> None:
     scenario = load_scenario("p_d_margin_two")
     rest = find_equilibrium(scenario, POSE)
     with pytest.raises(UsageError, match="no site 'x' among the ports; the sites are m, s"):

@@ -26,7 +26,7 @@ POSITIVE = st.floats(0.1, 10.0)
 OR_NONE = st.just(0.0) | POSITIVE
 
 
-def judged(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
+def judge_passivity(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
     Y = build_admittance(network.loop)
     w = refine_frequencies(
         Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop))
@@ -50,21 +50,21 @@ def test_masses_springs_and_dampers_are_passive(
     wires = [
         Wire(a, b, K, B) for n, (K, B) in enumerate(links) for a, b in ((n, n + 1), (n + 1, n))
     ]
-    found = judged(Network(m, d, k, tuple(wires)))
-    assert found.passive
-    assert found.lacking_nm_s_rad == 0.0
+    passivity = judge_passivity(Network(m, d, k, tuple(wires)))
+    assert passivity.passive
+    assert passivity.lacking_nm_s_rad == 0.0
 
 
 @settings(max_examples=20, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 1.0))
 def test_a_delay_without_damping_is_not_passive(K: float, delay_s: float) -> None:
-    assert not judged(pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
+    assert not judge_passivity(pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
 
 
 @pytest.mark.parametrize("T", [(0.2, 0.2), (0.1, 0.5), (0.0, 0.3)])
 @pytest.mark.parametrize("K", [(10.0, 10.0), (20.0, 3.0)])
 @pytest.mark.parametrize("share", [0.3, 1.0, 4.0])
-def test_p_d_is_passive_from_damping_on_that_literature_states(
+def test_p_d_is_passive_from_the_published_damping(
     K: tuple[float, float], T: tuple[float, float], share: float
 ) -> None:
     """4 d1 d2 >= (T1 + T2)^2 K1 K2, the energies weighted by 1 / K: at 2 % on either side."""
@@ -73,34 +73,34 @@ def test_p_d_is_passive_from_damping_on_that_literature_states(
         first = np.sqrt(product * factor) * share
         network = pair(K, (first, product * factor / first), T)
         # dampers of different size pass the damping on: their share of the weight cancels
-        assert judged(network, (1.0 / K[0], 1.0 / K[1])).passive is holds
+        assert judge_passivity(network, (1.0 / K[0], 1.0 / K[1])).passive is holds
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.5, 1.9])
-def test_what_p_d_lacks_is_k_t_less_its_damping(d: float) -> None:
+def test_p_d_lacks_k_t_less_its_damping(d: float) -> None:
     """-1/2 lambda_min(Z + Z^H) = K abs(sin(w T)) / w - d, most at w = 0: K T - d."""
-    assert judged(pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(2.0 - d, rel=1e-4)
+    assert judge_passivity(pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(2.0 - d, rel=1e-4)
 
 
 @settings(max_examples=15, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 0.5))
 def test_the_lacking_damping_is_just_enough_for_passivity(K: float, delay_s: float) -> None:
-    lacking = judged(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
+    lacking = judge_passivity(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
     for factor, holds in ((0.98, False), (1.02, True)):
         d = (0.1 + factor * lacking, 0.2 + factor * lacking)
         if lacking > 0.0:
-            assert judged(pair((K, K), d, (delay_s, delay_s))).passive is holds
+            assert judge_passivity(pair((K, K), d, (delay_s, delay_s))).passive is holds
 
 
-def test_the_range_where_p_d_is_active_follows_its_sine() -> None:
+def test_the_active_range_follows_its_sine() -> None:
     """d = K abs(sin(w T)) / w."""
-    (span,) = judged(pair(d=(1.0, 1.0))).minima.below
+    (span,) = judge_passivity(pair(d=(1.0, 1.0))).minima.below
     w = 2.0 * np.pi * span.to_hz
     assert np.sin(0.2 * w) / w == pytest.approx(0.1, rel=1e-6)
     assert span.from_hz == pytest.approx(1e-3)
 
 
-def test_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
+def test_winding_laws_lack_more_than_any_damper() -> None:
     """Z = m s + d + c / s^2: at low frequency a negative damping c / w^2."""
     loop = Network((1.0, 1.0), (2.0, 1.0), (0.0, 0.0)).loop
     A = loop.A.copy()
@@ -117,9 +117,9 @@ def test_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
         A=A, B=loop.B[:, :1], C=loop.C[:1], inputs=("a.tau1",), outputs=("a.qd1",)
     )
     Y = build_admittance(wound)
-    found = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
-    assert not found.passive
-    assert found.lacking_nm_s_rad == np.inf
+    passivity = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
+    assert not passivity.passive
+    assert passivity.lacking_nm_s_rad == np.inf
 
 
 @given(
@@ -164,7 +164,7 @@ def same(a: LinearLoop, b: LinearLoop) -> None:
 
 
 @given(K=POSITIVE, B=POSITIVE)
-def test_load_is_spring_and_damper_of_network(K: float, B: float) -> None:
+def test_a_load_is_spring_and_damper(K: float, B: float) -> None:
     network = pair()
     tied = network._replace(k=(0.0, K), d=(network.d[0], network.d[1] + B))
     same(hold_by_spring(network.loop, "b", K, B), tied.loop)
@@ -182,15 +182,15 @@ def test_a_loads_impedance_adds_at_its_port(K: float, B: float) -> None:
 
 @pytest.mark.parametrize("site", ["a", "b", "c"])
 def test_a_clamp_leaves_the_rest_of_the_impedance(site: str) -> None:
-    """Also where the clamp's own torque is reflected, and comes back by two delays."""
-    place = "abc".index(site)
-    keep = [n for n in range(3) if n != place]
+    """Also if the clamp's own torque is reflected, and comes back by two delays."""
+    index = "abc".index(site)
+    keep = [n for n in range(3) if n != index]
     clamped = clamp_site(REFLECTING.loop, site)
     assert clamped.inputs == tuple(f"{name}.tau1" for name in "abc" if name != site)
     assert not any(name.startswith(f"{site}.") for name in clamped.names)
     Y = build_admittance(REFLECTING.loop)(W)
     np.testing.assert_allclose(
-        build_admittance(clamped)(W), clamp_ports(Y, keep, [place]), rtol=1e-8, atol=1e-12
+        build_admittance(clamped)(W), clamp_ports(Y, keep, [index]), rtol=1e-8, atol=1e-12
     )
 
 
@@ -231,8 +231,11 @@ def scalar_hand(damping: float) -> HandMatrices:
 
 
 @pytest.mark.parametrize(("damping", "shown"), [(0.03, False), (0.05, True)])
-def test_hands_that_damp_what_ports_lack_are_stable(damping: float, shown: bool) -> None:
-    """P+d of K = 10, T = 0.2 s and d = 1.96 lacks 0.04 N m s/rad at each port (Nuno et al. 2009)."""
+def test_hands_with_the_lacking_damping_are_stable(damping: float, shown: bool) -> None:
+    """P+d of K = 10, T = 0.2 s and d = 1.96 lacks 0.04 N m s/rad at each port (Nuno et al.
+
+    2009).
+    """
     Y = build_admittance(pair(d=(1.96, 1.96)).loop)
     w = refine_frequencies(Y, build_frequency_grid(1e-3, 10.0, 0.2))
     hands = [[scalar_hand(damping), scalar_hand(2.0)]] * 2

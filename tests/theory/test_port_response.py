@@ -26,7 +26,7 @@ DELAYS = st.sampled_from([0.0, 0.05, 0.2, 1.0])
 
 
 @given(m=POSITIVE)
-def test_a_mass_alone_answers_with_one_over_j_w_m(m: float) -> None:
+def test_a_mass_answers_with_its_admittance(m: float) -> None:
     Y = build_admittance(Network((m,), (0.0,), (0.0,)).loop)(W)
     np.testing.assert_allclose(Y[:, 0, 0], 1.0 / (1j * W * m), rtol=1e-12)
 
@@ -48,7 +48,7 @@ def test_a_mass_alone_answers_with_one_over_j_w_m(m: float) -> None:
         max_size=4,
     ),
 )
-def test_the_answer_is_the_inverse_of_the_impedance_on_paper(
+def test_answers_invert_the_impedance_on_paper(
     m: tuple[float, ...], d: tuple[float, ...], k: tuple[float, ...], wires: list[Wire]
 ) -> None:
     """Springs, dampers, delays and reflected torque of any size."""
@@ -60,9 +60,7 @@ def test_the_answer_is_the_inverse_of_the_impedance_on_paper(
 
 
 @given(K=POSITIVE, B=POSITIVE)
-def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(
-    K: float, B: float
-) -> None:
+def test_undelayed_springs_and_dampers_are_reciprocal(K: float, B: float) -> None:
     at_once = build_admittance(pair((K, K), B=B, T=(0.0, 0.0)).loop)(W)
     np.testing.assert_allclose(at_once[:, 0, 1], at_once[:, 1, 0], rtol=1e-9)
     late = build_admittance(pair((K, K), B=B, T=(0.1, 0.3)).loop)(W)
@@ -70,8 +68,8 @@ def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(
     np.testing.assert_allclose(ratio, np.exp(1j * W * 0.2), rtol=1e-9)
 
 
-def test_what_is_read_may_be_past() -> None:
-    """Velocity minus what it was 0.3 s before."""
+def test_outputs_may_be_delayed() -> None:
+    """Velocity minus the velocity 0.3 s before."""
     loop = Network((2.0,), (1.0,), (0.0,)).loop
     Y = evaluate_transfer(loop, to_imaginary_axis(W), LoopOutput(loop.C, ((0.3, -loop.C),)))
     np.testing.assert_allclose(
@@ -83,12 +81,12 @@ def test_no_frequencies_no_answers() -> None:
     assert build_admittance(pair().loop)(np.zeros(0)).shape == (0, 2, 2)
 
 
-def test_a_floating_network_has_a_passive_pole_at_zero() -> None:
+def test_floating_networks_have_passive_poles_at_zero() -> None:
     floating = Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 7.0)))
-    found = find_pole_at_zero(floating.loop)
-    assert found.order == 1
-    assert found.passive
-    np.testing.assert_allclose(found.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
+    pole = find_pole_at_zero(floating.loop)
+    assert pole.order == 1
+    assert pole.passive
+    np.testing.assert_allclose(pole.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
     for tied in (floating._replace(k=(1.0, 0.0)), floating._replace(d=(1.0, 0.0)), pair()):
         none = find_pole_at_zero(tied.loop)
         assert none.order == 0
@@ -96,26 +94,26 @@ def test_a_floating_network_has_a_passive_pole_at_zero() -> None:
         assert not none.residue.any()
 
 
-def test_floating_masses_that_push_unevenly_have_an_active_pole() -> None:
+def test_uneven_floating_masses_have_an_active_pole() -> None:
     """7 N m/rad one way and 3 the other: the residue is no longer symmetric."""
-    found = find_pole_at_zero(
+    pole = find_pole_at_zero(
         Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 3.0))).loop
     )
-    assert found.order == 1
+    assert pole.order == 1
     np.testing.assert_allclose(
-        found.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9
+        pole.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9
     )
-    assert not found.passive
+    assert not pole.passive
 
 
-def test_following_a_floating_angle_gives_a_third_order_pole() -> None:
+def test_following_floating_angles_gives_third_order_poles() -> None:
     """qdd_a = u_a + 5 q_b and qdd_b = u_b: Y_ab = 5 / s^3."""
     loop = Network((1.0, 1.0), (0.0, 0.0), (0.0, 0.0)).loop
     A = loop.A.copy()
     A[1, 2] = 5.0
-    found = find_pole_at_zero(loop._replace(A=A))
-    assert found.order == 3
-    assert not found.passive
+    pole = find_pole_at_zero(loop._replace(A=A))
+    assert pole.order == 3
+    assert not pole.passive
 
 
 def test_ports_by_site_and_by_joint() -> None:
@@ -141,24 +139,33 @@ def test_ports_need_a_velocity_for_each_torque() -> None:
     d=st.tuples(POSITIVE, POSITIVE),
     T=st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.5)),
 )
-def test_what_is_felt_of_p_d_is_as_on_paper(
+def test_felt_p_d_impedance_is_as_on_paper(
     K: float, d: tuple[float, float], T: tuple[float, float]
 ) -> None:
-    """Clamped: m s + d + K / s. Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance."""
+    """Clamped: m s + d + K / s.
+
+    Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance.
+    """
     network = pair((K, K), d, T)
-    (found,) = measure_transparency(network.loop, "a", "b")
-    S = 1j * found.w_rad_s
-    own, other = (m * S + damping + K / S for m, damping in zip(network.m, d, strict=True))
+    (transparency,) = measure_transparency(network.loop, "a", "b")
+    S = 1j * transparency.w_rad_s
+    own_impedance, other = (
+        m * S + damping + K / S for m, damping in zip(network.m, d, strict=True)
+    )
     through = (K / S) ** 2 * np.exp(-S * sum(T))
-    np.testing.assert_allclose(found.clamped, own, rtol=1e-8)
-    np.testing.assert_allclose(found.free, own - through / other, rtol=1e-8)
+    np.testing.assert_allclose(transparency.clamped, own_impedance, rtol=1e-8)
+    np.testing.assert_allclose(transparency.free, own_impedance - through / other, rtol=1e-8)
     # the Z-width -h12 h21 / h22
-    inside = (found.w_rad_s >= 0.2 * np.pi) & (found.w_rad_s <= 20.0 * np.pi)
+    inside = (transparency.w_rad_s >= 0.2 * np.pi) & (transparency.w_rad_s <= 20.0 * np.pi)
     sizes = np.abs(through / other)[inside]
-    assert sizes.min() * (1.0 - 1e-6) <= found.difference_nm_s_rad <= sizes.max() * (1.0 + 1e-6)
+    assert (
+        sizes.min() * (1.0 - 1e-6)
+        <= transparency.difference_nm_s_rad
+        <= sizes.max() * (1.0 + 1e-6)
+    )
 
 
-def test_who_holds_the_third_site_counts() -> None:
+def test_the_third_sites_holder_counts() -> None:
     wires = tuple(Wire(i, j, 5.0, 0.0, 0.1) for i in range(3) for j in range(3) if i != j)
     loop = Network((1.0,) * 3, (1.0,) * 3, (0.0,) * 3, wires).loop
     (alone,) = measure_transparency(loop, "a", "c")
@@ -171,23 +178,23 @@ def test_who_holds_the_third_site_counts() -> None:
 @given(
     free=POSITIVE, clamped=POSITIVE, band=st.tuples(st.floats(0.02, 1.0), st.floats(2.0, 50.0))
 )
-def test_the_width_is_the_ratio_in_db_whatever_the_band(
+def test_the_width_is_a_ratio_in_db(
     free: float, clamped: float, band: tuple[float, float]
 ) -> None:
     w = 2.0 * np.pi * np.union1d(np.geomspace(0.01, 100.0, 401), band)
-    one = Transparency(
+    transparency = Transparency(
         "a", "b", 1, w, to_imaginary_axis(free * w), to_imaginary_axis(clamped * w), band
     )
-    assert one.ratio_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
+    assert transparency.ratio_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
     middle_rad_s = 2.0 * np.pi * np.sqrt(band[0] * band[1])
-    assert one.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
-    assert one.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
-    assert one.interpolate_magnitudes(1.0) == pytest.approx(
+    assert transparency.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
+    assert transparency.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
+    assert transparency.interpolate_magnitudes(1.0) == pytest.approx(
         (2.0 * np.pi * free, 2.0 * np.pi * clamped), rel=1e-6
     )
 
 
-def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
+def test_the_width_grows_with_coupling_stiffness() -> None:
     widths = [
         measure_transparency(pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[0].ratio_db
         for K in (1.0, 10.0, 100.0)
@@ -197,8 +204,10 @@ def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
 
 
 def test_two_sites_that_do_not_couple_feel_nothing() -> None:
-    (one,) = measure_transparency(Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b")
-    assert one.ratio_db == pytest.approx(0.0, abs=1e-12)
+    (transparency,) = measure_transparency(
+        Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b"
+    )
+    assert transparency.ratio_db == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -209,6 +218,6 @@ def test_two_sites_that_do_not_couple_feel_nothing() -> None:
         ("a", "a", "the operator's own site"),
     ],
 )
-def test_what_cannot_be_felt_is_refused(at: str, of: str, said: str) -> None:
+def test_unfelt_pairs_are_refused(at: str, of: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         measure_transparency(pair().loop, at, of)

@@ -1,4 +1,4 @@
-"""Ports against runs: a small sinusoidal torque in virtual time, and the velocities that it makes."""
+"""Ports against runs: a small sinusoidal torque in virtual time, and the resulting velocities."""
 
 from typing import Any
 
@@ -21,15 +21,15 @@ ROD = {"lc1_m": 0.5, "I1_kg_m2": 1 / 12, "lc2_m": 0.5, "I2_kg_m2": 1 / 12}
 
 
 def fitted(t_s: Array, values: Array, w_rad_s: float) -> Complex:
-    """The complex amplitude of sin(w t) in columns, beside a straight line."""
+    """Returns the complex amplitude of sin(w t) in columns, beside a straight line."""
     columns = np.column_stack(
         [np.sin(w_rad_s * t_s), np.cos(w_rad_s * t_s), np.ones_like(t_s), t_s]
     )
-    found = np.linalg.lstsq(columns, values, rcond=None)[0]
-    return np.asarray(found[0] + 1j * found[1], dtype=np.complex128)
+    solution = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return np.asarray(solution[0] + 1j * solution[1], dtype=np.complex128)
 
 
-def answered(
+def measure_admittance(
     name: str,
     overrides: dict[str, Any],
     joint: int,
@@ -37,7 +37,7 @@ def answered(
     settled_s: float,
     duration_s: float,
 ) -> Complex:
-    """Velocities of all joints per torque on one joint of m, by a run."""
+    """Returns velocities of all joints per torque on one joint of m, by a run."""
     t_s = np.arange(0.0, duration_s + 1.0, 1e-3)
     push = np.zeros((len(t_s), 3))
     push[:, 0], push[:, joint] = t_s, AMPLITUDE_NM * np.sin(2.0 * np.pi * hz * t_s)
@@ -53,7 +53,7 @@ def answered(
 
 @pytest.mark.parametrize("joint", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
-def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) -> None:
+def test_p_d_answers_sinusoids_by_its_admittance(hz: float, joint: int) -> None:
     overrides = {"control.d": 4.0, "sites.m.q0_rad": POSE, "sites.s.q0_rad": POSE}
     scenario = load_scenario("p_d_margin_two", overrides)
     Y = build_admittance(
@@ -61,14 +61,16 @@ def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) ->
             derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
         )
     )(np.array([2.0 * np.pi * hz]))[0]
-    found = answered("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
-    assert np.abs(found - Y[:, joint - 1]).max() < 0.01 * np.abs(Y[:, joint - 1]).max()
-    assert (np.abs(found - Y[:, joint - 1]) < 0.01 * np.abs(Y[:, joint - 1])).all()
+    admittance = measure_admittance("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
+    assert np.abs(admittance - Y[:, joint - 1]).max() < 0.01 * np.abs(Y[:, joint - 1]).max()
+    assert (np.abs(admittance - Y[:, joint - 1]) < 0.01 * np.abs(Y[:, joint - 1])).all()
 
 
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
-def test_paper_s_law_answers_sinusoid_as_its_admittance_says(hz: float) -> None:
-    """Rods that know themselves, a hand that holds m: learning, delay and the hand's spring are in it."""
+def test_paper_law_answers_by_its_admittance(hz: float) -> None:
+    """Rods with known parameters, a hand that holds m: learning, delay and the hand's spring
+    are included.
+    """
     hand = {
         "kind": "spring",
         "from_rad": POSE,
@@ -89,5 +91,7 @@ def test_paper_s_law_answers_sinusoid_as_its_admittance_says(hz: float) -> None:
         derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     )
     Y = build_admittance(hold_by_spring(bare, "m", 20.0, 3.0))(np.array([2.0 * np.pi * hz]))[0]
-    found = answered("two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0)
-    assert (np.abs(found - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()
+    admittance = measure_admittance(
+        "two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0
+    )
+    assert (np.abs(admittance - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()

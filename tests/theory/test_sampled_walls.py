@@ -26,7 +26,7 @@ WALL = {
 
 
 def windup(K: float, B: float = 0.0, b: float = 0.0) -> Scenario:
-    """`windup` at a sampled wall, whose arm has a damper in every joint."""
+    """Returns `windup` at a sampled wall, whose arm has a damper in every joint."""
     wall = {**WALL, "stiffness_n_m": K, "damping_n_s_m": B}
     damper = {"kind": "viscous", "damping_nm_s_rad": b}
     return load_scenario("windup", {ENVIRONMENT: [wall, damper]})
@@ -41,10 +41,10 @@ def edge(B: float = 0.0, b: float = 0.0) -> LinearEdge | None:
 
 @pytest.mark.long
 def test_the_map_in_contact_has_its_edge() -> None:
-    found = edge()
-    assert found is not None
-    assert found.value == pytest.approx(15.5e3, rel=0.005)
-    assert not found.stable_above
+    edge_found = edge()
+    assert edge_found is not None
+    assert edge_found.value == pytest.approx(15.5e3, rel=0.005)
+    assert not edge_found.stable_above
 
 
 @pytest.mark.long
@@ -61,38 +61,38 @@ def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:
     """b > K h / 2 + B with b = 1 / (n'J D^-1 J'n) where the arm rests."""
     q1, q2 = find_equilibrium(windup(5000.0, B, b)).q[2]
     J = np.array([-np.sin(q1) - np.sin(q1 + q2), -np.sin(q1 + q2)])
-    own = b / float(J @ J)
-    bound = 2.0 * 1000.0 * (own - B)
-    found = edge(B, b)
-    assert found is None or found.value > bound > 0.0
+    damper_damping = b / float(J @ J)
+    bound = 2.0 * 1000.0 * (damper_damping - B)
+    edge_found = edge(B, b)
+    assert edge_found is None or edge_found.value > bound > 0.0
 
 
-def say(K: float) -> CellClass:
-    """The class of a sweep's cell: it counts growth in contact, by the same map."""
+def classify_stiffness(K: float) -> CellClass:
+    """Returns the class of a sweep's cell, which counts growth in contact by the same map."""
     return classify_cell(windup(K).text, 480.0).verdict
 
 
 def end_alone(K: float) -> Stability:
-    """What the motion of the run shows by itself."""
+    """Returns the class by the motion of the run alone."""
     return run_whole(windup(K)).end.stability
 
 
 @pytest.mark.long
 def test_runs_have_the_edge_of_the_map() -> None:
-    """Stable 5 % below it, and not 5 % above, which shows without the map too."""
-    found = edge()
-    assert found is not None
-    assert say(0.95 * found.value) is CellClass.CONVERGED
-    assert say(1.05 * found.value) is not CellClass.CONVERGED
-    assert end_alone(0.95 * found.value) is Stability.SETTLED
-    assert end_alone(1.05 * found.value) is Stability.NOT_STABLE
+    """Stable 5 % below the edge, and not 5 % above, which shows without the map too."""
+    edge_found = edge()
+    assert edge_found is not None
+    assert classify_stiffness(0.95 * edge_found.value) is CellClass.CONVERGED
+    assert classify_stiffness(1.05 * edge_found.value) is not CellClass.CONVERGED
+    assert end_alone(0.95 * edge_found.value) is Stability.SETTLED
+    assert end_alone(1.05 * edge_found.value) is Stability.NOT_STABLE
 
 
 @pytest.mark.long
 def test_the_sweep_over_stiffness_is_monotone() -> None:
     """1 to 40 kN/m: stable up to 15, and from 16 on never."""
     for stable in (
-        [say(1e3 * K) is CellClass.CONVERGED for K in range(1, 41)],
+        [classify_stiffness(1e3 * K) is CellClass.CONVERGED for K in range(1, 41)],
         [end_alone(1e3 * K) is Stability.SETTLED for K in range(1, 41)],
     ):
         assert stable == [K <= 15 for K in range(1, 41)]
@@ -108,7 +108,7 @@ NORMAL /= np.linalg.norm(NORMAL)
 
 
 def press(state: ChainState, K: float) -> Scenario:
-    """Two arms of six joints: the hand of s leans it against a sampled wall of any direction."""
+    """Returns two arms of six joints: the hand of s presses it against a sampled wall of any direction."""
     q = state.q.tolist()
     to = state.q - state.jacobian[:3].T @ NORMAL * (FORCE_N / HAND_NM_RAD)
     wall = {"kind": "wall", "sampled": True, "normal": NORMAL.tolist(), "stiffness_n_m": K}
@@ -146,9 +146,11 @@ def press(state: ChainState, K: float) -> Scenario:
 
 
 def wall_stiffness(state: ChainState, K: float) -> Array:
-    """How the torque of the wall falls with the angles: J'n K n'J, and the turning of J under its force.
+    """Returns the fall of the wall's torque with the angles: J'n K n'J, and the turning of J
+    under its force.
 
-    The column of J of joint i turns with joint j: by w_j x J_i where j comes first, else by w_i x J_j.
+    The column of J of joint i turns with joint j: by w_j x J_i where j comes first, else by w_i
+    x J_j.
     """
     linear, angular = state.jacobian[:3], state.jacobian[3:]
     turning = np.empty((6, 6))
@@ -161,8 +163,10 @@ def wall_stiffness(state: ChainState, K: float) -> Array:
 
 
 def growth_of_ticks(state: ChainState, K: float) -> float:
-    """The rate of the largest eigenvalue of a tick's map, of Pinocchio's M and J: its hand acts at any time,
-    both laws and the wall are held, each arm sees the other as it was `DELAY_TICKS` ago."""
+    """Returns the rate of the largest eigenvalue of a tick's map, of Pinocchio's M and J: its
+    hand acts at any time, both laws and the wall are held, and each arm uses the other's pose
+    of `DELAY_TICKS` ago.
+    """
     none, one = np.zeros((6, 6)), np.eye(6)
     inverse = np.linalg.inv(state.inertia + np.diag(DRIVES))
     step: dict[str, tuple[Array, Array]] = {}
@@ -170,18 +174,18 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
         rates = np.block(
             [[none, one, none], [-hand * inverse, none, inverse], [none, none, none]]
         )
-        made = expm(H_S * rates)
-        step[site] = made[:12, :12], made[:12, 12:]
+        exponential = expm(H_S * rates)
+        step[site] = exponential[:12, :12], exponential[:12, 12:]
     size = 24 + 12 * DELAY_TICKS  # m, s, then (q_m, q_s) of the ticks before, latest first
     A = np.zeros((size, size))
     law = np.hstack([-np.diag(STIFF), -np.diag(DAMPING)])
     oldest = size - 12
     for n, (site, wall) in enumerate((("m", none), ("s", wall_stiffness(state, K)))):
         free, pushed = step[site]
-        own = slice(12 * n, 12 * n + 12)
-        A[own, own] = free + pushed @ (law - np.hstack([wall, none]))
+        own_rows = slice(12 * n, 12 * n + 12)
+        A[own_rows, own_rows] = free + pushed @ (law - np.hstack([wall, none]))
         peer = oldest + 6 * (1 - n)
-        A[own, peer : peer + 6] = pushed @ np.diag(STIFF)
+        A[own_rows, peer : peer + 6] = pushed @ np.diag(STIFF)
         A[24 + 6 * n : 30 + 6 * n, 12 * n : 12 * n + 6] = one
     A[36:, 24:-12] = np.eye(12 * (DELAY_TICKS - 1))
     return float(np.log(np.abs(np.linalg.eigvals(A)).max()) / H_S)
@@ -189,18 +193,20 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
 
 @pytest.mark.parametrize("n", range(3))
 def test_six_joints_in_contact_grow_like_pinocchios_arm(n: int) -> None:
-    """At walls in space, soft and hard; of several states the deepest counts, and without contact nothing."""
+    """At walls in space, soft and hard; of several states the deepest counts, and without
+    contact nothing does.
+    """
     state = chain_references()["arm6"].states[n]
     signs = set()
     for K in (1e4, 1e6):
         scenario = press(state, K)
         at = np.tile(state.q, (2, 1))
         theta = np.zeros((3, 2, 60))
-        away = at + np.linalg.pinv(state.jacobian[:3]) @ (2.0 * FORCE_N / K * NORMAL)
+        away_m = at + np.linalg.pinv(state.jacobian[:3]) @ (2.0 * FORCE_N / K * NORMAL)
         wanted = growth_of_ticks(state, K)
         assert find_contact_growth(
-            scenario, np.stack([away, at, away]), theta
+            scenario, np.stack([away_m, at, away_m]), theta
         ) == pytest.approx(wanted, rel=1e-5)
-        assert np.isnan(find_contact_growth(scenario, away[None], theta[:1]))
+        assert np.isnan(find_contact_growth(scenario, away_m[None], theta[:1]))
         signs.add(wanted > 0.0)
     assert signs == {True, False}

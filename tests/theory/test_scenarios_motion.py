@@ -14,7 +14,7 @@ A figure "at t" is the largest |e| of the two seconds from t on.
 import numpy as np
 import pytest
 
-from tests.theory.figures_of_runs import Overrides, measured, peak, printed, value
+from tests.theory.figures_of_runs import Overrides, approximate_figure, measured, peak, value
 from tests.virtual_runs import sampled
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
@@ -47,16 +47,14 @@ SETTLED_S = {
         for n, one in enumerate(SETTLED_S.items())
     ],
 )
-def test_settling_of_free_motion_is_no_monotone_function_of_delay(
-    delay_ms: float, settled_s: float
-) -> None:
-    made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
-    made.advance_to(30.0)
-    assert made.settled_s == printed(settled_s, 0.1)
+def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
+    fused_run = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
+    fused_run.advance_to(30.0)
+    assert fused_run.settled_s == approximate_figure(settled_s, 0.1)
 
 
 @pytest.mark.long
-def test_the_error_of_free_motion_grows_with_every_delay() -> None:
+def test_free_motions_error_grows_with_delay() -> None:
     times_s = np.arange(0.02, 20.01, 0.02)
     runs = [
         sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
@@ -64,7 +62,10 @@ def test_the_error_of_free_motion_grows_with_every_delay() -> None:
     ]
     rms = [float(np.sqrt(((run[..., :2] - run[..., 4:6]) ** 2).mean())) for run in runs]
     assert rms == sorted(rms)
-    assert (rms[0], rms[-1]) == (printed(0.1064, 1e-4), printed(0.1259, 1e-4))
+    assert (rms[0], rms[-1]) == (
+        approximate_figure(0.1064, 1e-4),
+        approximate_figure(0.1259, 1e-4),
+    )
     inertia = [run[0, -1, 12] for run in runs]  # theta_hat_1 of the first site
     assert np.ptp(inertia) > 0.1
 
@@ -76,17 +77,15 @@ def test_the_error_of_free_motion_grows_with_every_delay() -> None:
 def test_about_one_rest_some_delay_damps_common_motion(
     delay_ms: float, rate_per_s: float
 ) -> None:
-    found = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
-    assert found.decisive.rightmost is not None
-    assert found.decisive.rightmost.s.real == printed(rate_per_s, 0.001)
+    analysis = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
+    assert analysis.decisive.rightmost is not None
+    assert analysis.decisive.rightmost.s.real == approximate_figure(rate_per_s, 0.001)
 
 
 @pytest.mark.parametrize(
     ("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)]
 )
-def test_errors_and_speeds_decay_as_the_theorem_says(
-    name: str, error: float, speed: float
-) -> None:
+def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: float) -> None:
     last = sampled(load_scenario(name), (20.0,))[:, -1]
     assert np.abs(last[:, :2] - last[:, 4:6]).max() == pytest.approx(error, rel=0.15)
     assert np.abs(last[:, 2:4]).max() == pytest.approx(speed, rel=0.15)
@@ -95,8 +94,8 @@ def test_errors_and_speeds_decay_as_the_theorem_says(
 def test_the_papers_hands_hardly_move_joint_1() -> None:
     paper = load_scenario("paper")
     pushed, alone = (
-        sampled(made, np.arange(0.01, 20.01, 0.01))[..., :2]
-        for made in (paper, paper.without_hands())
+        sampled(scenario_run, np.arange(0.01, 20.01, 0.01))[..., :2]
+        for scenario_run in (paper, paper.without_hands())
     )
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
     assert np.abs(pushed - alone)[..., 0].max() <= 0.003
@@ -106,15 +105,18 @@ def test_the_papers_hands_hardly_move_joint_1() -> None:
 
 @pytest.mark.long
 def test_without_a_box_the_slave_returns() -> None:
-    made = measured("box", NO_BOX)
-    assert made.end_pose_rad["s"] == (printed(-0.011, 1e-3), printed(0.005, 1e-3))
+    windows = measured("box", NO_BOX)
+    assert windows.end_pose_rad["s"] == (
+        approximate_figure(-0.011, 1e-3),
+        approximate_figure(0.005, 1e-3),
+    )
 
 
 @pytest.mark.long
 def test_truth_on_edge_of_box_lets_them_sag() -> None:
-    made = measured("box", {**EDGE, "duration_s": 20.0})
-    assert made.end_pose_rad["s"][0] < -0.4
-    assert made.end_pose_rad["s"][1] < -0.7
+    windows = measured("box", {**EDGE, "duration_s": 20.0})
+    assert windows.end_pose_rad["s"][0] < -0.4
+    assert windows.end_pose_rad["s"][1] < -0.7
 
 
 @pytest.mark.long
@@ -122,25 +124,25 @@ def test_truth_on_edge_of_box_lets_them_sag() -> None:
 def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) -> None:
     row = {"m1": share, "m2": 1.0 - share}
     overrides: Overrides = {"timeline": [], "dominance.s": row, "duration_s": 10.0}
-    made = measured("training", overrides, (9.9, 10.0, "s"))
-    assert value(made, "q1_rad") + 0.6 == printed(offset_rad, 1e-3)
+    windows = measured("training", overrides, (9.9, 10.0, "s"))
+    assert value(windows, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
 
 
 HEALED = (6.0, 15.0, "s")
 
 
 @pytest.mark.long
-def test_a_link_that_heals_kicks_a_slave_that_went_on() -> None:
-    made = measured("outage", {}, HEALED)
-    assert value(made, "speed_peak_rad_s") == printed(0.41, 0.01)
-    assert value(made, "torque_peak_nm") == printed(35.0, 1.0)
-    assert made.synchronised_at_s == printed(12.4, 0.1)
+def test_healing_links_kick_slaves_that_continued() -> None:
+    windows = measured("outage", {}, HEALED)
+    assert value(windows, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
+    assert value(windows, "torque_peak_nm") == approximate_figure(35.0, 1.0)
+    assert windows.synchronised_at_s == approximate_figure(12.4, 0.1)
     uncut = measured("outage", {"link.outages_s": []}, HEALED)
-    assert value(uncut, "torque_peak_nm") == printed(18.8, 0.1)
+    assert value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
 
 
 @pytest.mark.long
-def test_a_ramped_return_needs_no_more_than_uncut_links() -> None:
+def test_ramped_returns_need_no_further_torque() -> None:
     held = measured("outage", {"on_stale.action": "hold"}, HEALED)
     uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
     assert value(held, "torque_peak_nm") <= value(uncut, "torque_peak_nm")
@@ -151,31 +153,31 @@ LATE = (9.0, 15.0, "s")
 
 
 def test_direct_force_reflection_hammers_at_200_ms() -> None:
-    made = measured("contact", {}, LATE)
-    assert value(made, "wall_mean_n") == printed(8.0, 1.0)
-    assert value(made, "wall_deviation_n") == printed(14.0, 1.0)
-    assert value(made, "wall_peak_n") == printed(52.0, 1.0)
-    assert value(made, "wall_hits") == 3
+    windows = measured("contact", {}, LATE)
+    assert value(windows, "wall_mean_n") == approximate_figure(8.0, 1.0)
+    assert value(windows, "wall_deviation_n") == approximate_figure(14.0, 1.0)
+    assert value(windows, "wall_peak_n") == approximate_figure(52.0, 1.0)
+    assert value(windows, "wall_hits") == 3
 
 
 def test_at_20_ms_there_is_one_hit() -> None:
-    made = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
-    assert value(made, "wall_hits") == 1
-    assert value(made, "wall_mean_n", 1) == printed(3.3, 0.1)
-    assert value(made, "wall_deviation_n", 1) < 0.01
+    windows = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
+    assert value(windows, "wall_hits") == 1
+    assert value(windows, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
+    assert value(windows, "wall_deviation_n", 1) < 0.01
 
 
 def test_a_fifth_of_the_force_settles() -> None:
-    made = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
-    assert value(made, "wall_mean_n") == printed(8.5, 0.1)
-    assert value(made, "wall_deviation_n") < 0.05
+    windows = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
+    assert value(windows, "wall_mean_n") == approximate_figure(8.5, 0.1)
+    assert value(windows, "wall_deviation_n") < 0.05
 
 
 def test_free_motion_is_calm_at_200_ms() -> None:
-    made = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
-    assert value(made, "speed_peak_rad_s") < 1e-6
-    assert made.end_error_rad is not None
-    assert made.end_error_rad < 1e-6
+    windows = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
+    assert value(windows, "speed_peak_rad_s") < 1e-6
+    assert windows.end_error_rad is not None
+    assert windows.end_error_rad < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -186,27 +188,27 @@ def test_free_motion_is_calm_at_200_ms() -> None:
     ],
     ids=str,
 )
-def test_laws_that_exchange_positions_pass_the_same_wall(law: dict[str, object]) -> None:
+def test_position_laws_pass_the_same_wall(law: dict[str, object]) -> None:
     """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
-    made = measured(
+    windows = measured(
         "contact",
         {"control": law, "sites.m.control": {}, "sites.s.control": {}, "duration_s": 25.0},
         (24.0, 25.0, "s"),
     )
-    assert value(made, "wall_mean_n") > 1.0
-    assert value(made, "wall_deviation_n") < 0.05
+    assert value(windows, "wall_mean_n") > 1.0
+    assert value(windows, "wall_deviation_n") < 0.05
 
 
 @pytest.mark.long
 def test_without_learning_gravity_nothing_winds_up() -> None:
-    made = measured(
+    windows = measured(
         "windup",
         {"control.Gamma": [1.0, 1.0, 1.0, 0.0, 0.0], "duration_s": 20.0},
         (10.0, 10.2, "s"),
         (19.8, 20.0, "s"),
     )
-    assert value(made, "wall_mean_n", 1) == pytest.approx(
-        value(made, "wall_mean_n", 0), abs=0.02
+    assert value(windows, "wall_mean_n", 1) == pytest.approx(
+        value(windows, "wall_mean_n", 0), abs=0.02
     )
 
 
@@ -236,11 +238,13 @@ A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force th
 
 
 @pytest.mark.parametrize(("name", "key", "window", "figure", "digit"), FIGURES)
-def test_limits_of_window_are_figure_within_its_bar(
+def test_window_limits_are_figures_within_bars(
     name: str, key: str, window: tuple[float, float], figure: float, digit: float
 ) -> None:
-    asked = {(w.from_s, w.to_s): dict(w.limits) for w in load_scenario(name).expect.windows}
-    least, most = asked[window][key]
+    limits_by_window = {
+        (w.from_s, w.to_s): dict(w.limits) for w in load_scenario(name).expect.windows
+    }
+    least, most = limits_by_window[window][key]
     bar = max(digit, 0.02 * abs(figure))
     assert figure - bar <= least + 1e-12
     assert most <= figure + bar + 1e-12
@@ -248,13 +252,13 @@ def test_limits_of_window_are_figure_within_its_bar(
 
 
 @pytest.mark.parametrize(("name", "settled_s"), [("free", 11.9), ("outage", 12.4)])
-def test_so_are_the_times_at_which_they_settle(name: str, settled_s: float) -> None:
+def test_settling_times_equal_their_figures(name: str, settled_s: float) -> None:
     by_s = load_scenario(name).expect.synchronised_by_s
     assert by_s is not None
     assert settled_s <= by_s <= 1.02 * settled_s
 
 
-def test_paper_ends_where_the_anchor_is() -> None:
+def test_paper_ends_at_the_anchor() -> None:
     expect = load_scenario("paper").expect
     assert set(expect.end_pose_rad.values()) == {(-0.1729, 0.0874)}
     assert expect.end_pose_within_rad <= 0.02 * 0.0874
@@ -264,7 +268,7 @@ CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
 
 
 @pytest.mark.parametrize(("name", "margin"), [("p_d_margin", 1.0), ("p_d_margin_two", 2.0)])
-def test_margin_is_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: float) -> None:
+def test_margins_follow_the_smallest_eigenvalue(name: str, margin: float) -> None:
     """d = abs(lambda_min(alpha)) K T."""
     scenario = load_scenario(name)
     (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
@@ -289,7 +293,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
 
 
 @pytest.mark.long
-def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
+def test_unequal_shares_have_their_own_margin() -> None:
     """-0.8, so 1.6: as `docs/tutorials/lab.md` asks."""
     row = {
         "m1": {"m2": 0.1, "s": 0.9},
@@ -313,36 +317,39 @@ def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> No
 def test_half_of_the_margin_grows_to_10_rad() -> None:
     faster_arms = {"limits.qd_limit_rad_s": 100.0}
     changes = {"control.d": 0.5, "duration_s": 40.0, **faster_arms}
-    made = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
-    assert [peak(made, 0), peak(made, 1)] == [printed(1.6, 0.1), printed(10.0, 1.0)]
+    windows = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
+    assert [peak(windows, 0), peak(windows, 1)] == [
+        approximate_figure(1.6, 0.1),
+        approximate_figure(10.0, 1.0),
+    ]
 
 
 @pytest.mark.long
-def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
-    made = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
-    assert peak(made) == printed(3e-3, 1e-3)
+def test_two_and_half_margins_decay_to_milliradians() -> None:
+    windows = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
+    assert peak(windows) == approximate_figure(3e-3, 1e-3)
 
 
 @pytest.mark.long
-def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
+def test_jitter_of_equal_mean_turns_the_verdict() -> None:
     jitter = measured("jitter", {}, (38.0, 40.0, ""))
     constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
     assert (jitter.end.error.trend, constant.end.error.trend) == (
         EnvelopeTrend.DECAYS,
         EnvelopeTrend.GROWS,
     )
-    assert peak(jitter) == printed(0.022, 0.001)
-    assert peak(constant) == printed(5.3, 0.1)
+    assert peak(jitter) == approximate_figure(0.022, 0.001)
+    assert peak(constant) == approximate_figure(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]
-    assert ages == [printed(25.0, 1.0)] * len(ages)
+    assert ages == [approximate_figure(25.0, 1.0)] * len(ages)
     assert {age.mean_ms for age in constant.ages.values()} == {200.0}
 
 
 @pytest.mark.long
-def test_play_out_makes_jitter_constant_and_the_run_diverge() -> None:
+def test_play_out_makes_the_jittered_run_diverge() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
     free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
-    assert peak(free) == printed(339.0, 1.0)
+    assert peak(free) == approximate_figure(339.0, 1.0)
     assert {age.max_ms for age in free.ages.values()} == {400.0}
     assert free.peak_speed_rad_s is not None
     assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s
@@ -353,9 +360,9 @@ def test_play_out_makes_jitter_constant_and_the_run_diverge() -> None:
     [({"link.order": "in_order"}, True), ({"rate_hz": 100}, False)],
     ids=["order", "rate"],
 )
-def test_order_makes_jitter_leave_its_limits_unlike_slower_rates(
+def test_order_makes_jitter_exceed_its_limits(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
-    made = FusedRun(load_scenario("jitter", changes))
-    made.advance_to(40.0)
-    assert (made.diverged_s is not None) is leaves
+    fused_run = FusedRun(load_scenario("jitter", changes))
+    fused_run.advance_to(40.0)
+    assert (fused_run.diverged_s is not None) is leaves

@@ -1,4 +1,4 @@
-"""The field against the compiled leaves, which are another person's arithmetic of the same equations."""
+"""The vector field against the compiled leaves, which compute the same equations by independent code."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,15 @@ seeds = st.integers(0, 2**32 - 1)
 laws = st.sampled_from(["adaptive", "known"])
 
 
-def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
-    """The rates as a tick computes them: errors, regressor, torque, what acts, forward dynamics."""
-    gains = one.gains
+def by_leaves(site_setup: SiteSetup, x: Array) -> dict[str, Array]:
+    """Returns the rates as a tick computes them: errors, regressor, torque, external torques,
+    forward dynamics.
+    """
+    gains = site_setup.gains
     q, qd = x[AT.q], x[AT.qd]
     Lambda = np.broadcast_to(gains.Lambda, 2)
     e, ed, r = control.control_errors(q, qd, x[AT.q_des], x[AT.qd_des], Lambda)
-    Y = regressor(one.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
+    Y = regressor(site_setup.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
     wide = np.inf
     Kp, Kd, K, d, k_f = (
         np.zeros(2) + gain for gain in (gains.Kp, gains.Kd, gains.K, gains.d, gains.k_f)
@@ -45,18 +47,20 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
         estimate = -np.asarray(gains.Gamma) * control.regressor_transpose_times(Y, r)
     else:
         tau = control.damped_torque(
-            known, one.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide
+            known, site_setup.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide
         )
         estimate = np.zeros(5)
-    rows, table = torque_source_rows(one.actors)
+    rows, table = torque_source_rows(site_setup.actors)
     acted, held = (
         np.array(
-            torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled)[:2]
+            torque_on_arm(LATE_S, q, qd, np.array(site_setup.lengths_m), rows, table, sampled)[
+                :2
+            ]
         )
         for sampled in (0, 1)
     )
     total = np.array(tau) + acted + held + x[AT.external_torque]
-    qdd = np.array(forward_dynamics(one.theta, one.g_m_s2, q, qd, total))
+    qdd = np.array(forward_dynamics(site_setup.theta, site_setup.g_m_s2, q, qd, total))
     return {
         "qdd": qdd,
         "estimate": estimate,
@@ -67,97 +71,105 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
 
 
 @given(seed=seeds, law=laws)
-def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
+def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
-    one = site(rng, law, actors(rng))
+    random_site = site(rng, law, actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
-    found, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
+    site_rates, wanted = evaluate_site_rates(random_site, x), by_leaves(random_site, x)
     for name, value in wanted.items():
         scale = 1.0 + max(
             np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()
         )
         inverse = (
-            np.abs(differentiate_site_rates(one, x).qdd[:, AT.external_torque]).max()
+            np.abs(differentiate_site_rates(random_site, x).qdd[:, AT.external_torque]).max()
             if name == "qdd"
             else 1.0
         )
-        assert np.abs(getattr(found, name) - value).max() <= 1e-12 * scale * max(
+        assert np.abs(getattr(site_rates, name) - value).max() <= 1e-12 * scale * max(
             1.0, inverse
         ), name
 
 
 @given(seed=seeds, law=laws)
 @settings(max_examples=50)
-def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
-    """Away from the surfaces of walls, where there is none."""
+def test_the_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
+    """Away from the surfaces of walls, where no derivative exists."""
     rng = np.random.default_rng(seed)
-    one = site(rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL])
+    random_site = site(
+        rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL]
+    )
     x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
-    found = differentiate_site_rates(one, x)
+    derivatives = differentiate_site_rates(random_site, x)
     for k in range(AT.arguments):
         ahead, behind = (
-            evaluate_site_rates(one, x + sign * step * np.eye(AT.arguments)[k])
+            evaluate_site_rates(random_site, x + sign * step * np.eye(AT.arguments)[k])
             for sign in (1, -1)
         )
-        for name in found._fields:
+        for name in derivatives._fields:
             difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
-            exact = getattr(found, name)[:, k]
+            exact = getattr(derivatives, name)[:, k]
             assert np.abs(difference - exact).max() <= 1e-6 * (
-                1.0 + np.abs(getattr(found, name)).max()
+                1.0 + np.abs(getattr(derivatives, name)).max()
             )
 
 
-def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
+def test_walls_push_on_one_side_only() -> None:
     rng = np.random.default_rng(1)
     wall = TorqueSource(
         TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0)
     )
-    one = site(rng, "known", [wall])
+    wall_site = site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
     assert not evaluate_site_rates(
-        one, x
+        wall_site, x
     ).external.any()  # the stretched arm is on the free side
     x[AT.q] = np.pi, 0.0
-    assert evaluate_site_rates(one, x).external[0] == pytest.approx(0.0, abs=1e-12)  # no lever
+    assert evaluate_site_rates(wall_site, x).external[0] == pytest.approx(
+        0.0, abs=1e-12
+    )  # no lever
     x[AT.q] = 2.5, 0.1
-    assert np.abs(evaluate_site_rates(one, x).external).max() > 1.0
+    assert np.abs(evaluate_site_rates(wall_site, x).external).max() > 1.0
     outward = np.sign(
         evaluate_site_rates(
-            one, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)
+            wall_site, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)
         ).external[0]
     )
     x[AT.qd] = outward * 1e3, 0.0
     assert not evaluate_site_rates(
-        one, x
+        wall_site, x
     ).external.any()  # faster outward than the spring would push
 
 
-def test_an_estimate_leaves_its_box_nowhere_and_returns() -> None:
+def test_estimates_never_leave_their_box_and_return() -> None:
     rng = np.random.default_rng(2)
-    one = site(rng, "adaptive")
+    adaptive_site = site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)
-    free = evaluate_site_rates(one, x).estimate
+    free = evaluate_site_rates(adaptive_site, x).estimate
     ends = (
         np.where(free > 0, x[AT.estimate], np.inf),
         np.where(free > 0, -np.inf, x[AT.estimate]),
     )
-    held = one._replace(gains=one.gains._replace(high=tuple(ends[0]), low=tuple(ends[1])))
+    held = adaptive_site._replace(
+        gains=adaptive_site.gains._replace(high=tuple(ends[0]), low=tuple(ends[1]))
+    )
     assert not evaluate_site_rates(held, x).estimate.any()
     assert not differentiate_site_rates(held, x).estimate.any()
-    back = one._replace(
-        gains=one.gains._replace(low=tuple(np.where(free > 0, x[AT.estimate], -np.inf)))
+    back = adaptive_site._replace(
+        gains=adaptive_site.gains._replace(
+            low=tuple(np.where(free > 0, x[AT.estimate], -np.inf))
+        )
     )
     assert (evaluate_site_rates(back, x).estimate == free).all()
 
 
-def test_what_is_exactly_on_an_edge_is_said() -> None:
+def test_states_exactly_on_edges_are_reported() -> None:
     rng = np.random.default_rng(3)
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0))
-    one = site(rng, "known", [wall])
+    wall_site = site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
-    assert not list(describe_switching_points(one, x))
-    on = one._replace(actors=(wall._replace(a=(sum(one.lengths_m), 0.0)),))
+    assert not list(describe_switching_points(wall_site, x))
+    on = wall_site._replace(actors=(wall._replace(a=(sum(wall_site.lengths_m), 0.0)),))
     assert list(describe_switching_points(on, x)) == [
         "x rests exactly on the surface of its wall 1: it counts as not touching"
     ]

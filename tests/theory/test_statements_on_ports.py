@@ -22,7 +22,9 @@ from trilat_net.scenario.describe import lacks_detailed_balance
 
 
 def one_factor(a: float) -> Any:
-    """Dominance by one factor: the first user's share in the slave is a, in the second user 1 - a."""
+    """Returns dominance by one factor: the first user's share in the slave is a, in the second
+    user 1 - a.
+    """
     return np.array([[0.0, 1.0 - a, a], [a, 0.0, 1.0 - a], [a, 1.0 - a, 0.0]])
 
 
@@ -39,13 +41,13 @@ def position_exchange(
 
 
 def least_margin(network: Network) -> float:
-    """The least eigenvalue under the best weights from 0.001 to 10 Hz."""
+    """Returns the least eigenvalue under the best weights from 0.001 to 10 Hz."""
     Y = build_admittance(network.loop)
     grid = build_frequency_grid(1e-3, 10.0, 0.2)
     return float(find_best_weights(Y(grid), np.arange(len(network.m))).margin.min())
 
 
-def test_shares_by_one_factor_are_reversible_at_three_places() -> None:
+def test_one_factor_is_reversible_at_three_places() -> None:
     """Errata 14: a (1 - a)^2 along the circle and a^2 (1 - a) back."""
     a = sp.Symbol("a")
     alpha = sp.Matrix([[0, 1 - a, a], [a, 0, 1 - a], [a, 1 - a, 0]])
@@ -64,7 +66,7 @@ def test_shares_by_one_factor_are_reversible_at_three_places() -> None:
 
 
 @pytest.mark.parametrize("d", [3.0, 30.0])
-def test_no_damping_makes_a_port_of_irreversible_shares_absolutely_stable(d: float) -> None:
+def test_irreversible_shares_defeat_any_damping(d: float) -> None:
     """Errata 14: three times and thirty times what reversible shares need."""
     assert least_margin(position_exchange(one_factor(0.5), d)) > -EIGENVALUE_ROUNDING
     assert least_margin(position_exchange(one_factor(0.25), d)) < -1e-4 / d
@@ -89,7 +91,7 @@ def test_reversible_shares_are_passive_once_damped_to_stability(count: int) -> N
 
 
 @pytest.mark.parametrize("d", [3.0, 30.0])
-def test_operators_that_only_add_mass_make_irreversible_shares_unstable(d: float) -> None:
+def test_added_mass_makes_irreversible_shares_unstable(d: float) -> None:
     """Errata 14: with w_i w_j a_ij a_ji alike, w = 1 / m, diag(w) alpha has complex eigenvalues."""
     alpha = one_factor(0.25)
     p = alpha * alpha.T
@@ -102,7 +104,7 @@ def test_operators_that_only_add_mass_make_irreversible_shares_unstable(d: float
     assert compute_delay_spectrum(network.loop, 1).verdict == "unstable"
 
 
-def test_a_scenario_of_known_gravity_and_irreversible_shares_says_so() -> None:
+def test_scenarios_of_irreversible_shares_say_so() -> None:
     rows: dict[str, Any] = {
         "dominance.m1": {"m2": 0.75, "s": 0.25},
         "dominance.m2": {"m1": 0.25, "s": 0.75},
@@ -116,13 +118,13 @@ def test_a_scenario_of_known_gravity_and_irreversible_shares_says_so() -> None:
 
 
 def reflecting(d_m: float, delay_s: float, slave_kg: float = 1.5) -> Network:
-    """A master that feels what pushes its slave: K = 100, d_s = 40, k_f = 1."""
+    """Returns a master that feels the forces on its slave: K = 100, d_s = 40, k_f = 1."""
     wires = (Wire(0, 1, 0.0, 0.0, delay_s, 1.0), Wire(1, 0, 100.0, 0.0, delay_s))
     return Network((1.0, slave_kg), (d_m, 40.0), (0.0, 0.0), wires)
 
 
 @pytest.mark.parametrize(("delay_s", "least"), [(0.02, 12.1), (0.2, 40.0), (1.0, 360.0)])
-def test_force_reflection_needs_master_damping_that_grows_with_delay(
+def test_force_reflection_needs_damping_growing_with_delay(
     delay_s: float, least: float
 ) -> None:
     """Errata 15: d_m >= k_f (2 K T + d_s)^2 / (4 d_s), K = 100 and d_s = 40; its edge within 1 %."""
@@ -131,7 +133,7 @@ def test_force_reflection_needs_master_damping_that_grows_with_delay(
     assert not criterion(reflecting(1.01 * least, delay_s)).below
 
 
-def test_the_slaves_best_damping_is_twice_stiffness_times_delay() -> None:
+def test_the_slaves_best_damping_is_2_kt() -> None:
     """Errata 15: 2 k_f K T, at d_s = 2 K T; and a slave of much mass asks for k_f K M / d_s."""
     K, T, d_s = sp.symbols("K T d_s", positive=True)
     bound = (2 * K * T + d_s) ** 2 / (4 * d_s)
@@ -142,7 +144,7 @@ def test_the_slaves_best_damping_is_twice_stiffness_times_delay() -> None:
 
 
 def reflection_damping(w: Any, K: float, M_s: float, d_s: float, T: float) -> Any:
-    """Errata 15: what Llewellyn's condition asks of d_m / k_f at the frequencies w."""
+    """Returns the damping d_m / k_f that Llewellyn's condition needs at the frequencies w, errata 15."""
     psi = np.arctan2(w * d_s, K - M_s * w**2)
     return K * np.sin(0.5 * psi + w * T) ** 2 / (w * np.sin(psi))
 
@@ -152,16 +154,18 @@ def reflection_frequencies(K: float, d_s: float, T: float) -> Any:
     return np.geomspace(1e-3 * slow, 1e3 * fast, 20001)
 
 
-def test_a_heavy_slave_asks_for_more_than_its_limits_of_low_and_high_frequencies() -> None:
-    """Errata 15: the edge is 1.943, 11 % more than the formula of w = 0, and within the sufficient bound."""
+def test_heavy_slaves_exceed_both_frequency_limits() -> None:
+    """Errata 15: the edge is 1.943, 11 % more than the formula of w = 0, and within the
+    sufficient bound.
+    """
     K, M_s, d_s, T = 142.0, 0.0512, 4.3, 4.16e-3
     w = reflection_frequencies(K, d_s, T)
-    asked = reflection_damping(w, K, M_s, d_s, T)
-    edge = float(asked.max())
+    damping = reflection_damping(w, K, M_s, d_s, T)
+    edge = float(damping.max())
     slow, fast = (2.0 * K * T + d_s) ** 2 / (4.0 * d_s), K * M_s / d_s
     enough = K * (2.0 * M_s + T * d_s) ** 2 / (4.0 * M_s * d_s)
     assert (edge, slow, fast, enough) == pytest.approx((1.943, 1.747, 1.691, 2.333), abs=5e-4)
-    assert w[asked.argmax()] == pytest.approx(69.0, abs=0.1)
+    assert w[damping.argmax()] == pytest.approx(69.0, abs=0.1)
     for k_f in (1.0, 0.3):
         wires = (Wire(0, 1, 0.0, 0.0, T, k_f), Wire(1, 0, K, 0.0, T))
         for part, fails in ((0.99, True), (1.01, False)):
@@ -173,7 +177,7 @@ def test_a_heavy_slave_asks_for_more_than_its_limits_of_low_and_high_frequencies
     ("K", "M_s", "d_s", "T"),
     [(60.0, 0.2, 6.0, 0.01), (300.0, 0.1, 9.0, 3e-3), (90.0, 0.6, 12.0, 0.02)],
 )
-def test_heavy_slaves_need_the_largest_value_over_frequencies(
+def test_heavy_slaves_need_the_largest_frequency_value(
     K: float, M_s: float, d_s: float, T: float
 ) -> None:
     """Errata 15: at least 5 % more than both limits, and no more than the sufficient bound."""
@@ -188,8 +192,11 @@ def test_heavy_slaves_need_the_largest_value_over_frequencies(
         assert bool(criterion(network).below) is fails
 
 
-def test_no_light_slave_asks_for_more_than_the_formula_of_low_frequencies() -> None:
-    """Errata 15: d_s^2 >= 4 K M_s. A heavy slave stays within the larger one of two formulas."""
+def test_light_slaves_follow_the_low_frequency_formula() -> None:
+    """Errata 15: d_s^2 >= 4 K M_s.
+
+    A heavy slave stays within the larger one of two formulas.
+    """
     rng = np.random.default_rng(15)
     for _ in range(300):
         K, d_s, T = 10.0 ** rng.uniform((0.0, -1.0, -3.0), (3.0, 2.5, 0.5))
@@ -203,10 +210,9 @@ def test_no_light_slave_asks_for_more_than_the_formula_of_low_frequencies() -> N
         assert reflection_damping(w, K, heavy, d_s, T).max() <= enough * (1.0 + 1e-9)
 
 
-def test_coupled_hands_are_not_weighed_like_independent_ones() -> None:
-    """Errata 9: K1 = 100, K2 = 1, 4 d1 d2 = 1.2 (2 T)^2 K1 K2 withstand any two operators.
-
-    Not one who holds both handles with a spring between one and the mirror image of the other.
+def test_coupled_hands_differ_from_independent_ones() -> None:
+    """Errata 9: K1 = 100, K2 = 1, 4 d1 d2 = 1.2 (2 T)^2 K1 K2 withstand any two operators, but
+    not one who holds both handles with a spring between one and the mirror image of the other.
     """
     d = float(np.sqrt(1.2 * 0.2**2 * 100.0))
     wires = (Wire(0, 1, 100.0, 0.0, 0.2), Wire(1, 0, 1.0, 0.0, 0.2))
@@ -223,7 +229,7 @@ def test_coupled_hands_are_not_weighed_like_independent_ones() -> None:
 
 
 @given(st.tuples(*[st.floats(-10.0, 10.0)] * 4))
-def test_a_clip_brings_no_estimate_further_from_the_truth(some: Any) -> None:
+def test_clips_never_move_estimates_off_truth(some: Any) -> None:
     """Errata 16: V of the estimates does not rise."""
     estimate, (low, theta, high) = some[0], sorted(some[1:])
     for truth in (low, theta, high):

@@ -1,9 +1,10 @@
-"""V of task space falls as the page says: along a closed loop of textbook equations that SciPy integrates.
+"""V of task space falls as documented: along a closed loop of textbook equations that SciPy
+integrates.
 
-One two-link arm of point masses follows the place of a peer that moves as it likes, as it was T before. Its
-equations are written here, its reference acceleration is a complex step, and nothing is the program's.
-
-The energy balance of the corrected Lyapunov functional, Eq. (16)-(22), along virtual runs.
+One two-link arm of point masses follows the delayed place of a peer that moves freely. Its
+equations are written here, its reference acceleration is a complex step, and no code of the
+program is used. The energy balance of the corrected Lyapunov functional, Eq. (16)-(22), along
+virtual runs.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,7 @@ STEP = 1e-30
 
 
 def peer(t: float) -> tuple[Vector, Vector, Vector]:
-    """Place, velocity and acceleration of the peer."""
+    """Returns place, velocity and acceleration of the peer."""
     turn = np.array([1.3, 0.9]) * t + np.array([0.2, 1.0])
     rate, size = np.array([1.3, 0.9]), np.array([0.15, 0.2])
     middle = np.array([0.9, 0.8])
@@ -35,7 +36,7 @@ def peer(t: float) -> tuple[Vector, Vector, Vector]:
     )
 
 
-def place(q: Vector) -> Vector:
+def tip_place(q: Vector) -> Vector:
     both = q[0] + q[1]
     return np.array([np.cos(q[0]) + np.cos(both), np.sin(q[0]) + np.sin(both)])
 
@@ -51,12 +52,12 @@ def jacobian(q: Vector) -> Vector:
 
 
 def regressor(q: Vector, qd: Vector, v: Vector, a: Vector) -> Vector:
-    """M a + C v + G of the textbook, C of Christoffel's symbols, as a matrix of its parameters."""
-    c, s, one, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
+    """Returns M a + C v + G of the textbook, C of Christoffel's symbols, as a matrix of its parameters."""
+    c, s, single, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
     first = 2 * c * a[0] + c * a[1] - s * (qd[1] * v[0] + (qd[0] + qd[1]) * v[1])
     return np.array(
         [
-            [a[0], first, a[1], one, both],
+            [a[0], first, a[1], single, both],
             [0.0, c * a[0] + s * qd[0] * v[0], a[0] + a[1], 0.0, both],
         ]
     )
@@ -68,13 +69,13 @@ def inertia(q: Vector) -> Vector:
 
 
 def reference(q: Vector, x_des: Vector) -> Vector:
-    return np.linalg.solve(jacobian(q), -LAMBDA * (place(q) - x_des))
+    return np.linalg.solve(jacobian(q), -LAMBDA * (tip_place(q) - x_des))
 
 
 def loop(
     t: float, q: Vector, qd: Vector, theta_hat: Vector
 ) -> tuple[Vector, Vector, Vector, Vector]:
-    """The sliding variable, the error's derivative, qdd and the estimate's derivative."""
+    """Returns the sliding variable, the error's derivative, qdd and the estimate's derivative."""
     x_des, xd_des, _ = peer(t - T)
     J, v = jacobian(q), reference(q, x_des)
     a = np.imag(reference(q + 1j * STEP * qd, x_des + 1j * STEP * xd_des)) / STEP
@@ -86,13 +87,13 @@ def loop(
 
 
 def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
-    """The derivative of V at a time by a difference of fourth order."""
+    """Returns the derivative of V at a time by a difference of fourth order."""
 
     def V(t: float) -> float:
         state = moves(t)
         q, qd, theta_hat, stored = state[:2], state[2:4], state[4:9], state[9]
         x_des = peer(t - T)[0]
-        r, e = qd - reference(q, x_des), place(q) - x_des
+        r, e = qd - reference(q, x_des), tip_place(q) - x_des
         off = theta_hat - THETA
         return float(
             0.5 * r @ inertia(q) @ r
@@ -104,7 +105,7 @@ def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
     return (8 * (V(t + h) - V(t - h)) - V(t + 2 * h) + V(t - 2 * h)) / (12 * h)
 
 
-def test_its_derivative_is_what_is_taken_and_passed_on() -> None:
+def test_vs_derivative_is_dissipation_and_passed_energy() -> None:
     def field(t: float, state: Vector) -> Vector:
         q, qd = state[:2], state[2:4]
         _, _, qdd, rate = loop(t, q, qd, state[4:9])
@@ -129,33 +130,37 @@ RATES = pytest.mark.parametrize("rate_hz", [1000, pytest.param(2000, marks=pytes
 
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("asymmetric", marks=pytest.mark.long)])
-def test_the_balance_closes_to_2e_5_of_the_largest_v(name: str) -> None:
+def test_the_balance_closes_to_2e_5(name: str) -> None:
     assert booked(name).residual <= 2e-5
 
 
 @RATES
 @pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.long), "asymmetric"])
-def test_its_error_is_of_second_order(name: str, rate_hz: int) -> None:
+def test_the_balance_error_is_second_order(name: str, rate_hz: int) -> None:
     assert order(name, "second_order", rate_hz) == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.long
 @RATES
-def test_digital_closes_it_to_some_percent_with_order_one(rate_hz: int) -> None:
+def test_digital_closes_to_some_percent(rate_hz: int) -> None:
     assert booked("paper", "digital").residual == pytest.approx(1.5e-2, rel=0.2)
     assert order("paper", "digital", rate_hz) == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_hands_do_work_that_the_balance_needs() -> None:
+def test_the_balance_needs_the_hands_work() -> None:
     b = booked("paper")
     assert np.abs(b.given).max() > 0.01 * b.V.max()
 
 
 @pytest.mark.long
-def test_beta_of_ones_fails_unless_columns_sum_to_one() -> None:
-    """The paper sets beta = (1, 1, 1) after Eq. (20): that is the right null vector, not the left one."""
-    made = run("asymmetric", {"duration_s": DURATION_S})
-    assert balance(made, np.full(3, 1 / 3)).residual > 1e-2
+def test_beta_of_ones_usually_fails() -> None:
+    """The paper sets beta = (1, 1, 1) after Eq.
+
+    (20), which is the right null vector, not the left one. Ones work only if columns sum to
+    one.
+    """
+    trajectory_of_run = run("asymmetric", {"duration_s": DURATION_S})
+    assert balance(trajectory_of_run, np.full(3, 1 / 3)).residual > 1e-2
 
 
 @pytest.mark.parametrize("name", ["free", "paper"])
@@ -175,7 +180,7 @@ def test_v_rises_while_a_hand_pushes() -> None:
 
 
 @pytest.mark.long
-def test_sites_may_scale_kd_if_beta_is_divided_by_scale() -> None:
+def test_scaled_kd_needs_beta_divided_alike() -> None:
     """Kd_i = c_i Kbar needs beta_i = pi_i / c_i; the paper's ones let V rise by a third of itself."""
     scale = {"m1": 10.0, "m2": 3.0, "s": 0.3}
     rows = {
@@ -183,7 +188,7 @@ def test_sites_may_scale_kd_if_beta_is_divided_by_scale() -> None:
         "m2": {"m1": 0.8, "s": 0.2},
         "s": {"m1": 0.8, "m2": 0.2},
     }
-    made = run(
+    trajectory_of_run = run(
         "free",
         {
             **{
@@ -196,9 +201,11 @@ def test_sites_may_scale_kd_if_beta_is_divided_by_scale() -> None:
             "duration_s": DURATION_S,
         },
     )
-    right = balance(made, left_null_vector(made.scenario) / list(scale.values()))
+    right = balance(
+        trajectory_of_run, left_null_vector(trajectory_of_run.scenario) / list(scale.values())
+    )
     assert np.diff(right.V).max() <= 5e-8 * right.V.max()
     assert right.residual <= 5e-5
-    ones = balance(made, np.ones(3)).V
+    ones = balance(trajectory_of_run, np.ones(3)).V
     assert (ones - np.minimum.accumulate(ones)).max() == pytest.approx(12.3, abs=0.2)
     assert ones[0] == pytest.approx(32.8, abs=0.1)

@@ -68,8 +68,8 @@ def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> P
     )
 
 
-def test_hands_back_at_their_ports_make_loop_that_had_them() -> None:
-    """A hand holds a pose by a torque: that had stayed when its spring and damper were taken off."""
+def test_hands_at_ports_restore_their_loop() -> None:
+    """A hand holds a pose by a torque, which remained when its spring and damper were taken off."""
     hand = {
         "kind": "spring",
         "from_rad": [-0.3, 1.6],
@@ -92,7 +92,7 @@ def test_hands_back_at_their_ports_make_loop_that_had_them() -> None:
         np.testing.assert_allclose(a.A, b.A, rtol=1e-9, atol=1e-9)
 
 
-def test_force_that_law_reflects_is_reflected_of_load_as_well() -> None:
+def test_reflected_force_includes_that_of_loads() -> None:
     hand = {"kind": "spring", "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 4.0}
     scenario = load_scenario(
         "contact", {"sites.m.hands": [], "sites.s.environment": [], "sites.s.hands": [hand]}
@@ -106,7 +106,7 @@ def test_force_that_law_reflects_is_reflected_of_load_as_well() -> None:
         np.testing.assert_allclose(a.B, b.B)
 
 
-def test_what_acted_at_the_rest_goes_on_acting() -> None:
+def test_torques_at_rest_continue_to_act() -> None:
     scenario = load_scenario("training")
     off = freeze_external_torques(
         derive_operating_conditions(scenario), find_equilibrium(scenario)
@@ -120,33 +120,35 @@ def test_what_acted_at_the_rest_goes_on_acting() -> None:
 
 @pytest.mark.parametrize("delay_ms", [0.0, 50.0, 200.0, 800.0])
 @pytest.mark.parametrize("name", ["free", "two_sites"])
-def test_the_papers_law_is_passive_in_r_not_qd(name: str, delay_ms: float) -> None:
-    """What its theorem states of the nonlinear loop with hands, docs/theory/errata-proof.md."""
+def test_the_papers_law_is_passive_in_r(name: str, delay_ms: float) -> None:
+    """The theorem of the nonlinear loop with hands, docs/theory/errata-proof.md."""
     _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     assert in_r(now, loop).passive
     assert not check_passivity(build_admittance(loop), grid(loop)).passive
 
 
-def test_dominance_rows_without_a_circle_need_the_proofs_weights() -> None:
-    """beta = (0.444, 0.130, 0.426) / mean: passive; the paper's ones: not, where little damping hides it."""
+def test_circle_free_dominance_needs_the_proofs_weights() -> None:
+    """beta = (0.444, 0.130, 0.426) / mean: passive; the paper's ones: not, where little damping
+    hides it.
+    """
     _, now, _, loop = at_pose("force_sharing", {**BARE, "control.Kp": 0.1})
     assert in_r(now, loop).passive
     assert not in_r(now, loop, ones=True).passive
 
 
-def test_kd_that_differs_by_a_scalar_is_weighted_out() -> None:
+def test_scalar_differences_of_kd_are_weighted_out() -> None:
     _, now, _, loop = at_pose("lyapunov")
     np.testing.assert_allclose(compute_proof_weights(now).sum(), 3.0)
     assert in_r(now, loop).passive
     assert not in_r(now, loop, ones=True).passive
 
 
-def test_laws_that_have_no_r_have_no_proof_output() -> None:
+def test_laws_without_r_lack_the_proofs_output() -> None:
     _, now, _, loop = at_pose("p_d_margin")
     assert build_proof_output(now, loop) is None
 
 
-def test_what_is_read_as_r_is_qd_plus_lambda_e() -> None:
+def test_r_is_read_as_qd_plus_lambda_e() -> None:
     """At a frequency where the delay turns by a half: r = qd + Lambda (q + mean of the peers' q)."""
     _, now, _, loop = at_pose("free")
     s = to_imaginary_axis(np.array([np.pi / 0.2]))
@@ -166,10 +168,10 @@ def test_statics_share_the_force_by_dominance() -> None:
     assert beta is not None
     Y = build_admittance(loop)(np.array([1e-5]))[0]
     slave = find_site_ports(loop, "s")
-    for place, site in enumerate(("m1", "m2")):
-        own = find_site_ports(loop, site)
-        felt = np.linalg.solve(Y[np.ix_(own, own)], Y[np.ix_(own, slave)])
-        np.testing.assert_allclose(felt.real, np.eye(2) * beta[2] / beta[place], atol=1e-3)
+    for index, site in enumerate(("m1", "m2")):
+        site_ports = find_site_ports(loop, site)
+        felt = np.linalg.solve(Y[np.ix_(site_ports, site_ports)], Y[np.ix_(site_ports, slave)])
+        np.testing.assert_allclose(felt.real, np.eye(2) * beta[2] / beta[index], atol=1e-3)
         np.testing.assert_allclose(felt.imag, 0.0, atol=1e-3)
 
 
@@ -190,7 +192,7 @@ def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: floa
     assert np.abs(alone.imag).max() < 1e-2 * expected.max()
 
 
-def test_against_a_clamped_site_the_learnt_gravity_winds_up() -> None:
+def test_clamped_sites_make_learnt_gravity_wind_up() -> None:
     """Impedance as 1 / w^2 towards zero, its phase that of a negative damper."""
     _, _, _, loop = at_pose("two_sites", ALONE["two_sites"])
     held = clamp_site(loop, "s")

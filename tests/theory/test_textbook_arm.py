@@ -24,7 +24,7 @@ def placed(q: Array) -> PlacedArm:
 
 
 @given(a=links, q=angles, qd=speeds, v=speeds, acc=speeds)
-def test_they_are_those_of_two_bodies(
+def test_matrices_are_those_of_two_bodies(
     a: ArmLinks, q: Array, qd: Array, v: Array, acc: Array
 ) -> None:
     theta = theta_from_links(a)
@@ -51,15 +51,15 @@ def test_the_acceleration_needs_the_torque(
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_columns_are_arms_of_their_own(seed: int) -> None:
-    """Many states in one call are as many calls."""
+def test_columns_are_separate_arms(seed: int) -> None:
+    """Many states in one call equal as many calls."""
     rng = np.random.default_rng(seed)
     theta = np.array([3.0, 1.0, 1.0, 2.0, 1.0])
     q, qd, torque = rng.normal(size=(3, 2, 4))
     each = np.zeros(4) + theta[:, None]
-    found = placed(q).joint_acceleration(each, qd, torque)
+    accelerations = placed(q).joint_acceleration(each, qd, torque)
     for n in range(4):
-        assert found[:, n] == pytest.approx(
+        assert accelerations[:, n] == pytest.approx(
             placed(q[:, n]).joint_acceleration(theta, qd[:, n], torque[:, n])
         )
 
@@ -82,8 +82,10 @@ STOPS = {"stop_stiffness": 200.0, "stop_damping": 2.0}
 def chain(name: str, gravity: Array, **drive: float) -> ChainSetup:
     read = REFERENCES[name].chain
     joints = [
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
-        for one in read.joints
+        ChainJoint(
+            joint.kind == "prismatic", joint.axis, joint.rotation, joint.origin_m, **drive
+        )
+        for joint in read.joints
     ]
     return ChainSetup(tuple(joints), tuple(gravity), read.tip_origin_m)
 
@@ -92,7 +94,7 @@ def parameters(name: str) -> Array:
     return np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints])
 
 
-def apart(got: Array, wanted: Array) -> float:
+def largest_difference(got: Array, wanted: Array) -> float:
     return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
 
 
@@ -105,18 +107,18 @@ def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
         Y = placed.regressor_matrix(state.qd, state.v, state.a)
         qdd = placed.joint_acceleration(theta, state.qd, state.tau)
         M = placed.inertia_matrix(theta)
-        assert apart(torque, state.inverse_dynamics) <= 1e-12
-        assert apart(Y.T @ state.r, state.regressor_transpose_r) <= 1e-12
-        assert apart(M, state.inertia) <= 1e-12
-        assert apart(qdd, state.forward_dynamics) <= 100 * np.finfo(float).eps * np.linalg.cond(
-            M
-        )
-        assert apart(placed.end_effector_position(), state.tip_position) <= 1e-12
-        assert apart(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
+        assert largest_difference(torque, state.inverse_dynamics) <= 1e-12
+        assert largest_difference(Y.T @ state.r, state.regressor_transpose_r) <= 1e-12
+        assert largest_difference(M, state.inertia) <= 1e-12
+        assert largest_difference(qdd, state.forward_dynamics) <= 100 * np.finfo(
+            float
+        ).eps * np.linalg.cond(M)
+        assert largest_difference(placed.end_effector_position(), state.tip_position) <= 1e-12
+        assert largest_difference(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
 
 
-def test_columns_are_chains_of_their_own() -> None:
-    """Many states in one call are as many calls, and a complex step is the limit of differences."""
+def test_columns_are_separate_chains() -> None:
+    """Many states in one call equal as many calls, and a complex step is the limit of differences."""
     first, second, _ = REFERENCES["arm7"].states
     made, theta = chain("arm7", first.gravity, **DRIVE, **STOPS), parameters("arm7")
 
@@ -124,32 +126,35 @@ def test_columns_are_chains_of_their_own() -> None:
         return PlacedChain(made, q).joint_acceleration(theta, qd, tau)
 
     both = [np.stack(pair, axis=1) for pair in ((first.q, second.q), (first.qd, second.qd))]
-    found = acceleration(
+    accelerations = acceleration(
         *both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1)
     )
     for n, one in enumerate((first, second)):
-        assert apart(found[:, n], acceleration(one.q, one.qd, one.tau, theta)) <= 1e-12
+        assert (
+            largest_difference(accelerations[:, n], acceleration(one.q, one.qd, one.tau, theta))
+            <= 1e-12
+        )
     for k in range(7):
         off = 1e-6 * np.eye(7)[k]
         ahead, behind = (
             acceleration(first.q + way * off, first.qd, first.tau, theta) for way in (1, -1)
         )
         exact = acceleration(first.q + 1e-24j * off, first.qd, first.tau, theta).imag / 1e-30
-        assert apart(exact, (ahead - behind) / 2e-6) <= 1e-6
+        assert largest_difference(exact, (ahead - behind) / 2e-6) <= 1e-6
 
 
 @pytest.mark.parametrize("name", ["random3", "arm7"])
-def test_drives_and_stops_are_those_of_the_compiled_leaves(name: str) -> None:
+def test_drives_and_stops_equal_compiled_leaves(name: str) -> None:
     for state in REFERENCES[name].states:
         made, theta = chain(name, state.gravity, **DRIVE, **STOPS), parameters(name)
         rows, qdd = build_chain(made.joints, 12), np.zeros(len(state.q))
         place_joints(rows, state.q)
         find_acceleration(rows, theta, state.gravity, state.q, state.qd, state.tau, qdd)
-        found = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
-        assert apart(found, qdd) <= 1e-11
+        acceleration = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
+        assert largest_difference(acceleration, qdd) <= 1e-11
 
 
-def test_the_planar_arm_is_a_chain_of_two_joints() -> None:
+def test_planar_arms_are_two_joint_chains() -> None:
     """Rods of different lengths, hung on z axes in the x-y plane."""
     (l1, m1), (l2, m2), g = (0.7, 1.3), (1.1, 0.8), 9.81
     outer, axis, upright = (
@@ -171,10 +176,15 @@ def test_the_planar_arm_is_a_chain_of_two_joints() -> None:
         np.outer(values, np.ones(6)) for values in (np.concatenate(bodies), theta)
     )
     assert (
-        apart(
+        largest_difference(
             placed.required_torque(of_chain, qd, v, a), planar.required_torque(of_arm, qd, v, a)
         )
         <= 1e-12
     )
-    assert apart(placed.gravity_torque(of_chain), planar.gravity_torque(of_arm)) <= 1e-12
-    assert apart(placed.position_jacobian()[:2], planar.position_jacobian()) <= 1e-12
+    assert (
+        largest_difference(placed.gravity_torque(of_chain), planar.gravity_torque(of_arm))
+        <= 1e-12
+    )
+    assert (
+        largest_difference(placed.position_jacobian()[:2], planar.position_jacobian()) <= 1e-12
+    )

@@ -64,7 +64,7 @@ SITES = [
 
 
 def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
-    """A site whose torques have no limit, under a plain digital scheme."""
+    """Returns a site whose torques have no limit, under a plain digital scheme."""
     control = LAWS.get(law, {"law": "p_f", "K": 30.0, "d": 4.0, "k_f": 0.4})
     given_changes = {"control": control, "scheme": "digital", **overrides}
     written = planar_task() if text == "planar" else posed_arms()
@@ -72,8 +72,10 @@ def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
     return scenario.setup(site)._replace(tau_limit_nm=(1e9,), qd_limit_rad_s=(1e9,))
 
 
-def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
-    """The state of a site, and of each peer its pose, velocity and torque, with poses about `apart` away."""
+def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array]]:
+    """Draws the state of a site, and of each peer its pose, velocity and torque, with poses
+    about `apart` away.
+    """
     rng, at = np.random.default_rng(seed), lay_out_arguments(site)
     state = np.zeros(at.states)
     state[at.q] = np.array(site.q0) + rng.normal(0.0, 0.1, at.joints)
@@ -81,20 +83,26 @@ def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
         rng.normal(0.0, 0.3, at.joints),
         rng.normal(0.0, 1.0, at.parameters),
     )
-    own = evaluate_site_rates(
+    own_rates = evaluate_site_rates(
         site, np.concatenate([state, np.zeros(at.arguments - at.states)])
     ).x
     peers = []
     for _ in site.links:
-        pose = own + np.concatenate([rng.normal(0.0, apart, 3), np.zeros(len(own) - 3)])
-        if len(own) > 3:
-            turned = Rotation.from_rotvec(rng.normal(0.0, apart, 3)) * Rotation.from_rotvec(
-                own[3:]
+        pose = own_rates + np.concatenate(
+            [rng.normal(0.0, distance, 3), np.zeros(len(own_rates) - 3)]
+        )
+        if len(own_rates) > 3:
+            turned = Rotation.from_rotvec(rng.normal(0.0, distance, 3)) * Rotation.from_rotvec(
+                own_rates[3:]
             )
             pose[3:] = turned.as_rotvec()
         peers.append(
             np.concatenate(
-                [pose, rng.normal(0.0, 0.2, len(own)), rng.normal(0.0, 2.0, len(own))]
+                [
+                    pose,
+                    rng.normal(0.0, 0.2, len(own_rates)),
+                    rng.normal(0.0, 2.0, len(own_rates)),
+                ]
             )
         )
     return state, peers
@@ -103,8 +111,10 @@ def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
 def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
     at, alpha = lay_out_arguments(site), np.array([0.0, *(link.alpha for link in site.links)])
     m, x = at.coordinates, np.concatenate([state, np.zeros(at.arguments - at.states)])
-    own = evaluate_site_rates(site, x).x
-    x[at.q_des] = evaluate_reference(alpha, own, [own, *(peer[:m] for peer in peers)])
+    derivative = evaluate_site_rates(site, x).x
+    x[at.q_des] = evaluate_reference(
+        alpha, derivative, [derivative, *(peer[:m] for peer in peers)]
+    )
     x[at.qd_des] = sum(a * peer[m : 2 * m] for a, peer in zip(alpha[1:], peers, strict=True))
     x[at.peer_torque] = sum(
         -a * peer[2 * m :] for a, peer in zip(alpha[1:], peers, strict=True)
@@ -113,11 +123,16 @@ def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
 
 
 def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Array]:
-    """Torque, estimates and accelerations as one compiled tick has them, the accelerations as h goes to 0."""
+    """Returns torque, estimates and accelerations of one compiled tick, the accelerations as h
+    goes to 0.
+    """
     at, accelerations, records = lay_out_arguments(site), [], []
     for rate_hz in (10_000, 20_000):
-        one = site._replace(rate_hz=rate_hz)
-        arrays, buffers = build_site_arrays(one, pages=8), build_tick_buffers(one)
+        faster_site = site._replace(rate_hz=rate_hz)
+        arrays, buffers = (
+            build_site_arrays(faster_site, pages=8),
+            build_tick_buffers(faster_site),
+        )
         s = arrays.site[0]
         s.q, s.qd, s.theta_hat = state[at.q], state[at.qd], state[at.estimate]
         for link, peer in zip(arrays.links, peers, strict=True):
@@ -126,49 +141,50 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
         accelerations.append((s.qd - state[at.qd]) * rate_hz)
         rates = (s.theta_hat - state[at.estimate]) * rate_hz
         columns = {
-            name: buffers.record[place].copy() for name, place in one.layout.columns().items()
+            name: buffers.record[column].copy()
+            for name, column in faster_site.layout.columns().items()
         }
         records.append({**columns, "estimate": rates})
     return {**records[1], "qdd": 2.0 * accelerations[1] - accelerations[0]}
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
-@pytest.mark.parametrize("apart", [0.3, 0.0])
-def test_a_site_is_that_of_a_compiled_tick(
-    text: str, name: str, law: str, apart: float
-) -> None:
-    """Its torque, what it sends, and how it moves and learns, where peers are apart and where they agree."""
+@pytest.mark.parametrize("distance", [0.3, 0.0])
+def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance: float) -> None:
+    """Its torque, its messages, its motion and its learning, for peers that are apart and for
+    peers that agree.
+    """
     site = build(text, name, law)
     for seed in range(3):
-        state, peers = draw(site, seed, apart)
-        found, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
-        names = {"tau": found.tau, "x": found.x, "xd": found.xd, "wrench": -found.reflected}
+        state, peers = draw(site, seed, distance)
+        rates, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
+        names = {"tau": rates.tau, "x": rates.x, "xd": rates.xd, "wrench": -rates.reflected}
         for key, value in names.items():
             assert np.abs(value - wanted[key]).max() <= 1e-9 * (
                 1.0 + np.abs(wanted[key]).max()
             ), key
         if law == "adaptive":
-            size = 1.0 + np.abs(found.estimate).max()
-            assert np.abs(found.estimate - wanted["estimate"]).max() <= 1e-7 * size
-        size = 1.0 + np.abs(found.qdd).max()
-        assert np.abs(found.qdd - wanted["qdd"]).max() <= 2e-5 * size
+            size = 1.0 + np.abs(rates.estimate).max()
+            assert np.abs(rates.estimate - wanted["estimate"]).max() <= 1e-7 * size
+        size = 1.0 + np.abs(rates.qdd).max()
+        assert np.abs(rates.qdd - wanted["qdd"]).max() <= 2e-5 * size
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
-def test_its_jacobian_is_the_difference_of_compiled_ticks(
-    text: str, name: str, law: str
-) -> None:
+def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str) -> None:
     site, step = build(text, name, law), 1e-6
     at = lay_out_arguments(site)
     state, peers = draw(site, 4, 0.0)
     x = np.concatenate([state, np.zeros(at.arguments - at.states)])
-    own = evaluate_site_rates(site, x).x
-    x[at.q_des], x[at.qd_des], x[at.peer_torque] = own + 0.05, 0.1, 0.3
+    derivative = evaluate_site_rates(site, x).x
+    x[at.q_des], x[at.qd_des], x[at.peer_torque] = derivative + 0.05, 0.1, 0.3
     exact = differentiate_site_rates(site, x)
     places = [*range(2 * at.joints), *range(at.states, at.inputs.stop)]
 
     def tau(place: int, by: float) -> Array:
-        """The torque of a tick with one of its arguments off; all peers send what the first does."""
+        """Returns the torque of a tick with one of its arguments off; all peers send the sample
+        of the first.
+        """
         moved = x.copy()
         moved[place] += by
         sent = np.concatenate([moved[at.q_des], moved[at.qd_des], -moved[at.peer_torque]])
@@ -185,17 +201,17 @@ def test_rate_of_jacobian_is_its_derivative_along_motion(seed: int) -> None:
     site = build("posed", "s", "pd_d")
     rng = np.random.default_rng(seed)
     q, qd = rng.normal(0.0, 1.0, (2, len(site.q0)))
-    moved, here = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)
+    moved, placed_arm = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)
     assert isinstance(moved, PlacedChain)
-    assert isinstance(here, PlacedChain)
+    assert isinstance(placed_arm, PlacedChain)
     wanted = moved.pose_jacobian().imag / COMPLEX_STEP
-    assert np.abs(here.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (
+    assert np.abs(placed_arm.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (
         1.0 + np.abs(wanted).max()
     )
     R, turned = (
-        here.end_effector_orientation(),
+        placed_arm.end_effector_orientation(),
         moved.end_effector_orientation().imag / COMPLEX_STEP,
     )
     across = turned @ R.T
-    w = here.pose_jacobian()[3:] @ qd
+    w = placed_arm.pose_jacobian()[3:] @ qd
     assert np.array([across[2, 1], across[0, 2], across[1, 0]]) == pytest.approx(w, abs=1e-12)

@@ -1,4 +1,4 @@
-"""The loop as it is computed, against runs tick by tick, and against the continuous loop in the limit."""
+"""The sampled loop against runs tick by tick, and against the continuous loop in the limit."""
 
 import itertools
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ POSE = (-0.1729, 0.0874)
 
 
 def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
-    """Continuous and as computed, about one pose."""
+    """Returns the continuous and the sampled spectrum, about one pose."""
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
-    found = compute_sampled_spectrum(now, rest, wanted)
-    assert found is not None
-    return continuous, found
+    spectrum = compute_sampled_spectrum(now, rest, wanted)
+    assert spectrum is not None
+    return continuous, spectrum
 
 
 HANDS = [
@@ -63,10 +63,12 @@ RESTS_AT_ZERO = ("sync",)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("delay_ms", [0.0, 30.0])
-def test_small_deviation_goes_tick_by_tick_as_run_does(
+def test_small_deviations_follow_runs_tick_by_tick(
     law: str, scheme: str, delay_ms: float
 ) -> None:
-    """The companion matrix carries it on; the run begins there, its peers' histories at their start poses."""
+    """The companion matrix advances the deviation; the run begins there, its peers' histories
+    at their start poses.
+    """
     small = 1e-6
     pose = (0.0, 0.0) if law in RESTS_AT_ZERO else POSE
     hands = [{**hand, "from_rad": list(pose)} for hand in HANDS]
@@ -95,7 +97,7 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(
         f"{site}.q{j + 1}": off[i, j]
         for (i, site), j in itertools.product(enumerate("ms"), range(2))
     }
-    X = begun(
+    X = start_state(
         whole,
         late,
         names,
@@ -115,7 +117,7 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(
         assert np.abs(X[places] - q[k]).max() <= 4e-4 * size, k
 
 
-def begun(
+def start_state(
     whole: Array,
     late: NDArray[np.intp],
     names: Sequence[str],
@@ -123,12 +125,12 @@ def begun(
     *,
     uses_trapezoid: bool,
 ) -> Array:
-    """The state at tick 0: the past as the start, tau_-1 = tau_0, and theta_0 = theta_hat0."""
+    """Returns the state at tick 0: the past as the start, tau_-1 = tau_0, and theta_0 = theta_hat0."""
     X = np.concatenate(
         [start, np.tile(start[late], (len(whole) - len(names)) // max(1, len(late)))]
     )
-    thetas = [place for place, name in enumerate(names) if ".theta" in name]
-    taus = [place for place, name in enumerate(names) if ".tau" in name]
+    thetas = [index for index, name in enumerate(names) if ".theta" in name]
+    taus = [index for index, name in enumerate(names) if ".tau" in name]
     if uses_trapezoid:  # theta_0 = eta_0 + h/2 f_0, and a tick adds h f to eta
         X[thetas] -= 0.5 * ((whole @ X)[thetas] - X[thetas])
     if taus:
@@ -138,18 +140,18 @@ def begun(
 
 @pytest.mark.parametrize(("scheme", "order"), [("second_order", 2), ("digital", 1)])
 @pytest.mark.parametrize("delay_ms", [0.0, 100.0])
-def test_it_goes_to_continuous_loop_with_order_of_its_scheme(
+def test_sampled_loops_converge_with_their_schemes_order(
     scheme: str, order: int, delay_ms: float
 ) -> None:
     """Both with the same delay in use; the rightmost root, at rates that halve the period."""
-    apart = []
+    distances = []
     for rate_hz in (100, 200, 400):
         scenario = load_scenario(
             "paper", {"scheme": scheme, "link.delay_ms": delay_ms, "rate_hz": rate_hz}
         )
         continuous, computed = spectra(scenario, 2)
-        apart.append(abs(continuous.roots[0].s - computed.roots[0].s))
-    for coarse, fine in itertools.pairwise(apart):
+        distances.append(abs(continuous.roots[0].s - computed.roots[0].s))
+    for coarse, fine in itertools.pairwise(distances):
         assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
 
 
@@ -157,16 +159,16 @@ def test_it_goes_to_continuous_loop_with_order_of_its_scheme(
     ("rate_hz", "stable"), [(80, False), (100, False), (125, True), (200, True)]
 )
 def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable: bool) -> None:
-    """About Gamma g^2 h > Kp it swings by itself; the extrapolated torque does not."""
-    given = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
-    _, digital = spectra(load_scenario("paper", {"scheme": "digital", **given}))
+    """About Gamma g^2 h > Kp it oscillates by itself; the extrapolated torque does not."""
+    changes = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
+    _, digital = spectra(load_scenario("paper", {"scheme": "digital", **changes}))
     assert (digital.verdict == "stable") == stable
-    _, second = spectra(load_scenario("paper", given))
+    _, second = spectra(load_scenario("paper", changes))
     assert second.verdict == "stable"
 
 
-def test_a_swing_that_grows_is_that_of_a_run() -> None:
-    """P+d just below its edge at 50 Hz: the run's swing grows as the sampled root says."""
+def test_a_growing_swing_matches_a_run() -> None:
+    """P+d just below its edge at 50 Hz: the run's swing grows at the sampled root."""
     scenario = load_scenario(
         "p_d_margin_two",
         {
@@ -179,19 +181,19 @@ def test_a_swing_that_grows_is_that_of_a_run() -> None:
         },
     )
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3005, 0.0))
-    found = compute_sampled_spectrum(now, rest, 2)
-    assert found is not None
-    root = found.roots[0].s
+    spectrum = compute_sampled_spectrum(now, rest, 2)
+    assert spectrum is not None
+    root = spectrum.roots[0].s
     run = trajectories(scenario).sites["m"]
     late = run.t_s > 8.0
-    apart = np.abs(run.q - run.q_des)[late, 0]
+    distance = np.abs(run.q - run.q_des)[late, 0]
     half = round(np.pi / root.imag * 50)
-    peaks = [apart[k : k + half].max() for k in range(0, len(apart) - half, half)]
+    peaks = [distance[k : k + half].max() for k in range(0, len(distance) - half, half)]
     slope, _ = np.polyfit(np.arange(len(peaks)) * half / 50, np.log(peaks), 1)
     assert slope == pytest.approx(root.real, rel=0.03)
 
 
-def test_a_held_push_moves_a_mass_by_half_h_squared() -> None:
+def test_held_pushes_move_masses_exactly() -> None:
     Phi, Gamma = discretise_zero_order_hold(
         np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [2.0]]), 0.1
     )

@@ -1,4 +1,4 @@
-"""The sampled loop at one rate and constant ages by its companion matrix, all eigenvalues of it."""
+"""The sampled loop at one rate and constant ages by its companion matrix, with all its eigenvalues."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,9 @@ class TickRecursion(NamedTuple):
 
 
 def build_recursion(conditions: OperatingConditions, rest: Equilibrium) -> TickRecursion:
-    """Of sites at one rate, a sample of tick m being in use d = max(1, ceil(T / h)) ticks later."""
+    """Returns the recursion of sites at one rate, a sample of tick m being in use d = max(1,
+    ceil(T / h)) ticks later.
+    """
     (rate_hz,) = {site.rate_hz for site in conditions.sites}
     loop = couple_ticks(conditions, rest)
     n, late = len(loop.S), np.flatnonzero(np.abs(list(loop.effects.values())).sum(axis=(0, 1)))

@@ -52,9 +52,9 @@ from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.operators.program_hand import find_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 from trilat_net.signals import Interrupt

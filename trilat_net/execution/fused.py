@@ -48,15 +48,15 @@ from ..core.step.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange,
 from ..core.step.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError, count_nouns
 from ..log.log_reader import Log
+from ..own_code.code_consent import find_user_laws
 from ..scenario import Scenario
-from ..scenario.code_consent import find_user_laws
 from ..scenario.operators.kernel_operators import Wall
 from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.plant_player import PlantPlayer
 from ..scenario.validate import refuse_external_arms
 
 
-def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
+def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
     """Returns, for each eight bytes of a data type, whether they are a floating-point number.
 
     The fields of all data types of the kernel are multiples of eight bytes.
@@ -67,8 +67,20 @@ def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
     for field_dtype, offset, *_ in dtype.fields.values():
         start = offset // 8
         stop = (offset + field_dtype.itemsize) // 8
-        is_float[start:stop] = _mark_floats(field_dtype)
+        is_float[start:stop] = mark_floats(field_dtype)
     return is_float
+
+
+def scale_differences(x: Array, y: Array, factor: float) -> Array:
+    """Returns y + factor (x - y), the numbers x with their differences from y scaled.
+
+    Args:
+        x: Numbers of a run.
+        y: The same numbers of another run. They replace results that would not be finite.
+        factor: The factor.
+    """
+    mixed: Array = y + factor * (x - y)
+    return np.where(np.isfinite(mixed), mixed, y)
 
 
 class RunState:
@@ -92,7 +104,7 @@ class RunState:
             # If `reshape` had made a copy, changes would not reach the run.
             assert np.shares_memory(flat, array)
             self._bits.append(flat)
-            self._floats.append(np.tile(_mark_floats(array.dtype), array.size))
+            self._floats.append(np.tile(mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
         """Multiplies the difference between this state and another one by a factor.
@@ -115,9 +127,8 @@ class RunState:
             changed = np.flatnonzero((bits != other_bits) & is_float)
             x = bits.view(np.float64)[changed]
             y = other_bits.view(np.float64)[changed]
-            mixed: Array = y + factor * (x - y)
             bits[:] = other_bits
-            bits.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
+            bits.view(np.float64)[changed] = scale_differences(x, y, factor)
 
 
 def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
@@ -253,6 +264,11 @@ class RunMemory(NamedTuple):
         peaks: Peaks in intervals of 50 ms, see `run_until`.
         sums: Sums over the records, shape (N,), see `SumsRow`.
         settled_rad: Position error below which an arm counts as settled, rad.
+        laws: Numbers of compiled laws that are not a part of the kernel. None if no site has
+            such a law.
+        compiled_laws: These laws, by the index of their site.
+        has_plain_law: True if a site has a law in plain Python.
+        feed: Inputs of a recorded run.
     """
 
     tables: SiteArrays
@@ -262,6 +278,10 @@ class RunMemory(NamedTuple):
     peaks: Array
     sums: RowArray
     settled_rad: float
+    laws: LawArrays | None
+    compiled_laws: Mapping[int, CompiledLaw]
+    has_plain_law: bool
+    feed: ReplayedInputs
 
 
 class FusedRun:
@@ -450,6 +470,12 @@ class FusedRun:
             peaks=self._peaks,
             sums=self._sums,
             settled_rad=self._settled_rad,
+            laws=self._law_arrays,
+            compiled_laws={
+                i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)
+            },
+            has_plain_law=any(isinstance(law, PlainLaw) for law in self._laws.values()),
+            feed=self._inputs.feed,
         )
 
     def _update_links(self) -> None:

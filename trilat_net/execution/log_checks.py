@@ -22,8 +22,8 @@ from ..log.accounting import MIN_COVERAGE, describe_unknown_ends
 from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
-from ..scenario.code_consent import find_user_laws
-from ..scenario.imported_code import CodeConsents, allowed_code
+from ..own_code.code_consent import find_user_laws
+from ..own_code.imported_code import CodeConsents, allowed_code
 from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 

@@ -45,8 +45,8 @@ from ..log.site_log import SiteLog
 from ..log.view_rates import VIZ_HZ
 from ..net.messages import READABLE, State
 from ..net.wire import decode
+from ..own_code.code_consent import find_user_laws
 from ..results import Result, finite_or_none
-from ..scenario.code_consent import find_user_laws
 from .rerun_execution import (
     RerunExecution,
     RerunOverrides,

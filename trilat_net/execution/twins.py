@@ -20,7 +20,8 @@ Invariant:
 import math
 import re
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -327,14 +328,13 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
     reason = explain_not_repeatable(log, own_laws=own_laws)
     if reason:
         raise NotRepeatable(f"twins cannot be run: {reason}")
-    runs = _TwinRuns(
+    return _run_twins(
         scenario=log.scenario,
         pushes=pushes,
         ticks=[len(log[name]) for name in log.scenario.names],
         inputs=read_run_inputs(log),
         log=log,
     )
-    return runs.run()
 
 
 def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
@@ -357,7 +357,44 @@ def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: fl
     """
     rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
     ticks = [max(1, round(duration_s * rate_hz)) for rate_hz in rates_hz]
-    return _TwinRuns(scenario, pushes, ticks).run()
+    return _run_twins(scenario, pushes, ticks)
+
+
+LANE_SITE_TICKS = 100_000_000
+"""Number of site ticks from which the code for twins side by side is compiled.
+
+The compilation takes some ten seconds. Code that exists is used for any number.
+"""
+
+
+def _run_twins(
+    scenario: Scenario,
+    pushes: Sequence[Push],
+    ticks: Sequence[int],
+    inputs: RunInputs | None = None,
+    log: Log | None = None,
+) -> Twins:
+    """Executes a run and its twins, side by side in lanes if possible, else one by one.
+
+    Args:
+        scenario: The scenario.
+        pushes: Push of each twin.
+        ticks: Number of ticks of each site.
+        inputs: Inputs of a recorded run that is repeated. None for a new run.
+        log: Log of the recorded run, with which the repeated run is compared.
+    """
+    # A single run must not load the code of lanes.
+    from .lanes.twin_lanes import LaneEndedError, suits_twins
+
+    run = FusedRun(scenario, inputs=inputs)
+    has_changes = inputs is not None and bool(inputs.changes)
+    is_even = len(set(ticks)) == 1
+    count = 1 + len(pushes)
+    if is_even and not has_changes and suits_twins(run, count, ticks[0], LANE_SITE_TICKS):
+        # If an arm leaves its limits, all runs are executed again, one by one.
+        with suppress(LaneEndedError):
+            return _LaneTwinRuns(scenario, pushes, ticks, inputs, log).run()
+    return _TwinRuns(scenario, pushes, ticks, inputs, log).run()
 
 
 class _TwinRuns:
@@ -391,9 +428,7 @@ class _TwinRuns:
         self._ends_s = _plan_windows(max(durations_s), pushes)
         longest_window_s = float(np.diff(self._ends_s, prepend=0.0).max())
         keep = math.ceil(longest_window_s * max(rates_hz)) + 2
-        runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(1 + len(pushes))]
-        for run in runs:
-            run.plan(ticks)
+        runs = self._make_runs(scenario, ticks, inputs, keep)
         self._run = runs[0]
         self._twins = runs[1:]
 
@@ -410,6 +445,27 @@ class _TwinRuns:
         self._pushed: list[list[int]] = [[] for _ in pushes]
         self._died: list[int | None] = [None for _ in pushes]
         self._same = True
+
+    def _make_runs(
+        self,
+        scenario: Scenario,
+        ticks: Sequence[int],
+        inputs: RunInputs | None,
+        keep: int,
+    ) -> list[Any]:
+        """Returns the run and its twins, before their first tick.
+
+        Args:
+            scenario: The scenario.
+            ticks: Number of ticks of each site.
+            inputs: Inputs of a recorded run that is repeated, or None.
+            keep: Number of records of each site that must be kept.
+        """
+        count = 1 + len(self._pushes)
+        runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(count)]
+        for run in runs:
+            run.plan(ticks)
+        return runs
 
     def run(self) -> Twins:
         """Simulates a run and its repetitions with a push, and returns the differences."""
@@ -586,6 +642,89 @@ class _TwinRuns:
             factor = size / distance
             twin.scale_difference(self._run, factor)
             self._scale[n] -= math.log(factor)
+
+
+class _LaneTwinRuns(_TwinRuns):
+    """A run and its twins, side by side in lanes, with the same results as `_TwinRuns`."""
+
+    def _make_runs(
+        self,
+        scenario: Scenario,
+        ticks: Sequence[int],
+        inputs: RunInputs | None,
+        keep: int,
+    ) -> list[Any]:
+        """Returns the run and its twins, each in a lane."""
+        from .lanes.twin_lanes import LaneTwin, TwinLanes
+
+        run = FusedRun(scenario, inputs=inputs)
+        count = 1 + len(self._pushes)
+        self._lanes = TwinLanes(
+            run, count=count, ticks=ticks[0], feed=run.memory.feed, kept=keep
+        )
+        return [LaneTwin(self._lanes, lane) for lane in range(count)]
+
+    def _execute_window(self, end_s: float) -> None:
+        """Executes the run and its twins to the end of a window, and measures the differences.
+
+        Args:
+            end_s: End of the window, in s.
+        """
+        lanes = self._lanes
+        lanes.step_to(math.ceil(end_s * NS_PER_S) - 1)
+        t_ns = lanes.read_times()
+        if self._log is not None:
+            everything = slice(None)
+            run = slice(0, 1)
+            records = [
+                (t_ns, lanes.read_records(i, everything, run)[:, :, 0])
+                for i in range(len(self._layouts))
+            ]
+            self._compare_with_log(self._log, records)
+
+        measured = []
+        for n, pushed in enumerate(self._pushed):
+            if pushed and self._died[n] is None:
+                measured.append(n)
+        self._measure_window(t_ns, measured)
+        for n, push in enumerate(self._pushes):
+            if n in measured:
+                self._renew_difference(n, end_s)
+            elif not self._pushed[n] and push.at_s <= end_s:
+                # A twin without a push has the state of the run.
+                self._push(n, end_s)
+
+    def _measure_window(self, t_ns: Ints, measured: Sequence[int]) -> None:
+        """Adds the course of the run and of the differences in one window to the paths.
+
+        Args:
+            t_ns: Times of the ticks of the window, ns.
+            measured: Indices of the twins that are measured.
+        """
+        if not len(t_ns):
+            return
+        twins = np.array(measured, dtype=np.int64)
+        buckets = t_ns * BUCKETS_PER_S // NS_PER_S
+        starts = np.flatnonzero(np.diff(buckets, prepend=-1))
+        rows = buckets[starts]
+        ends = np.append(starts[1:], len(t_ns))
+        runs = slice(0, 1 + len(self._pushes))
+        column = 0
+        for i, layout in enumerate(self._layouts):
+            qd = self._lanes.read_records(i, layout.columns()["qd"], runs)
+            columns = slice(column, column + layout.joints)
+            column += layout.joints
+            speed = np.maximum.reduceat(np.abs(qd[:, :, 0]), starts, axis=0)
+            self._speed[rows, columns] = np.maximum(self._speed[rows, columns], speed)
+            difference = qd[:, :, 1 + twins] - qd[:, :, :1]
+            peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)
+            unscaled = np.log(peaks) + self._scale[twins]
+            for position, n in enumerate(measured):
+                known = self._largest[n][rows, columns]
+                self._largest[n][rows, columns] = np.maximum(known, unscaled[:, :, position])
+                self._last[n][rows, columns] = difference[ends - 1, :, position]
+        for n in measured:
+            self._scales[n, rows] = self._scale[n]
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:

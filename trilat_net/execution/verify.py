@@ -40,9 +40,9 @@ from ..log.running_digest import Integrity
 from ..log.session_check import judge_integrity
 from ..log.site_log import SiteLog
 from ..net.messages import MODE_WORDS, STATE_VECTORS, State
+from ..own_code.code_consent import find_user_laws
 from ..recorded_change import count_skipped_ticks
 from ..scenario import parse_core_change
-from ..scenario.code_consent import find_user_laws
 from .resumption import ArrivalEntry, RecordedInputs, read_output
 
 TOLERANCE = 1e-9

@@ -52,9 +52,9 @@ from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.timing import LoopStats
 from ..net.topics import number_message, skipped_numbers
 from ..net.wire import encode, encode_state
+from ..own_code.imported_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
-from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.program_hand import POLICY, make_hand_players
 from ..scenario.plant_player import PlantPlayer, make_plant_players
 from ..scenario.validate import refuse_external_arms

@@ -53,9 +53,9 @@ from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.topics import count_under_way
 from ..net.wire import decode
+from ..own_code.code_consent import LawFiles, allow_logged_code
 from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
-from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.operators.program_hand import FAILED_HAND
 from ..scenario.sample_uses import PictureDelay

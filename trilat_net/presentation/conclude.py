@@ -30,9 +30,9 @@ from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
-from ..scenario.code_consent import may_run_user_laws
+from ..own_code.code_consent import may_run_user_laws
+from ..own_code.imported_code import allowed_code
 from ..scenario.expect import END_WINDOW_S
-from ..scenario.imported_code import allowed_code
 from ..workers import worker_pool
 from . import terminal_output
 from .certificate_text import (

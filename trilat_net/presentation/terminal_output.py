@@ -351,7 +351,7 @@ def warn_user_laws(log: "Log") -> None:
     Args:
         log: The log.
     """
-    from ..scenario.code_consent import find_user_laws
+    from ..own_code.code_consent import find_user_laws
 
     for law in find_user_laws(log.scenario):
         if law.allowed:

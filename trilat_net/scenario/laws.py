@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Union
 
 from ..laws.interface import ControlLaw, LawSettings, format_class_name
-from .imported_code import ImportedLaw
+from ..own_code.imported_code import ImportedLaw
 
 _LAWS_PACKAGE = "trilat_net.laws"
 

@@ -19,8 +19,8 @@ import numpy as np
 from ..core.step.ticks import PlantState
 from ..core.step.vectors import Array
 from ..errors import PlantFailed, ScenarioError, count_nouns, describe_exception
-from .class_arguments import make_own_instance
-from .imported_code import CodeKey, Watch, call_directly, import_class
+from ..own_code.class_arguments import make_own_instance
+from ..own_code.imported_code import CodeKey, Watch, call_directly, import_class
 from .own_plant import OwnPlant
 from .scenario_types import Scenario
 

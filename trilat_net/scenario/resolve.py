@@ -37,12 +37,13 @@ from ..core.links import dominance
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import Frozen, TomlTable, reword_problem, split_refusal
 from ..files import open_regular
+from ..own_code.imported_code import CLASS_PATTERN, read_code
+from ..own_code.sent_channel import parse_classes, read_sends
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
 from .expect import Expect, number_window_joints
-from .imported_code import CLASS_PATTERN, read_code
 from .key_checks import (
     VectorCounts,
     check_choice,
@@ -67,7 +68,6 @@ from .scenario_types import (
     Scenario,
     SiteSpec,
 )
-from .sent_channel import parse_classes, read_sends
 from .urdf import MAX_CHARACTERS
 
 _TOP_LEVEL_KEYS = (

@@ -38,6 +38,7 @@ from ..core.step.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs
+from ..own_code.sent_channel import build_channel
 from ..recorded_change import RecordedChange
 from ..recorded_change import SiteOrder as SiteOrder
 from ..records import Layout
@@ -58,7 +59,6 @@ from .laws import ChosenLaw
 from .operators import Environment, Operator
 from .operators.kernel_operators import LiveHand
 from .own_plant import OwnPlant
-from .sent_channel import build_channel
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):

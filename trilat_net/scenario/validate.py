@@ -27,17 +27,17 @@ from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
 from ..laws.interface import LawSettings
+from ..own_code.imported_code import ImportedLaw
+from ..own_code.sent_channel import check_sends
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .delay_models import LinkBase
 from .delay_models.kernel_delays import ConstantDelay, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
-from .imported_code import ImportedLaw
 from .operators import kernel_operators
 from .operators.program_hand import ProgramHand
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
-from .sent_channel import check_sends
 
 RANK_TOLERANCE = 1e-6
 """Ratio of a singular value to the largest one below which the direction counts as immobile."""

@@ -29,9 +29,8 @@ from ..files import import_extra
 from ..log.provenance import collect_provenance
 from ..net.clock import SystemClock
 from ..net.host_names import UnknownHost, check_hosts
+from ..own_code.imported_code import NamedCode, read_code
 from ..package_names import PACKAGE_COMMANDS
-from ..scenario.code_consent import ImportedCode
-from ..scenario.imported_code import read_code
 
 CONNECT_S = 10.0
 """Longest time to wait for a scheduler to reply, and for its first worker, in s."""
@@ -259,7 +258,7 @@ class DaskCluster:
         workers = self._client.scheduler_info()["workers"]
         return sum(worker["nthreads"] for worker in workers.values())
 
-    def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
+    def require(self, laws: Sequence[NamedCode]) -> WorkerRequirements:
         """Determines what workers need for a study, and checks the workers that are present.
 
         A worker must have the same program, arithmetic and versions of packages as this

@@ -28,7 +28,7 @@ from ..core.step.fingerprint import compute_fingerprint
 from ..errors import ScenarioError, join_arguments
 from ..files import describe_write_error, extend_file
 from ..log.provenance import collect_provenance
-from ..scenario.imported_code import name_law_classes
+from ..own_code.imported_code import name_law_classes
 from ..scenario.key_checks import is_distribution
 from .executor import Progress, Together, WorkerPool
 

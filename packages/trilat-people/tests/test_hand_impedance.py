@@ -1,4 +1,4 @@
-"""Hands that are known: springs of the kernel, and bodies with mass that also do things by themselves."""
+"""Hands with known impedance: springs of the kernel, and bodies with mass that also move on their own."""
 
 import dataclasses
 import json
@@ -35,18 +35,20 @@ def moved_from(site: str, amplitude_nm: float, duration_s: float = 28.0) -> dict
     return {**stiff, **weightless, f"sites.{site}.hands": sines}
 
 
-def drawn(random: np.random.Generator, low: float, high: float) -> Array:
+def draw_gain(random: np.random.Generator, low: float, high: float) -> Array:
     turn = random.uniform(0.0, np.pi)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    found: Array = axes @ np.diag(random.uniform(low, high, 2)) @ axes.T
-    return found
+    gain: Array = axes @ np.diag(random.uniform(low, high, 2)) @ axes.T
+    return gain
 
 
-def held(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
+def identify_drawn_hand(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
     """A hand that is drawn at m1, moved from the slave over a link that delays, jitters and loses."""
     random = np.random.default_rng(seed)
     true = HandMatrices(
-        drawn(random, 0.5, 2.0), drawn(random, 5.0, 25.0), drawn(random, 80.0, 400.0)
+        draw_gain(random, 0.5, 2.0),
+        draw_gain(random, 5.0, 25.0),
+        draw_gain(random, 80.0, 400.0),
     )
     plant = {
         "class": "tests.own_code:HeldArm",
@@ -62,9 +64,10 @@ def held(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
     return true, identify_hand(tn.simulate("free", changes), "m1")
 
 
-def covered(true: HandMatrices, found: HandImpedance) -> Array:
+def covered(true: HandMatrices, hand_impedance: HandImpedance) -> Array:
     rows = [
-        np.abs(getattr(found, k) - one) <= found.halves[k] for k, one in true._asdict().items()
+        np.abs(getattr(hand_impedance, k) - gain) <= hand_impedance.halves[k]
+        for k, gain in true._asdict().items()
     ]
     return np.array(rows)
 
@@ -84,19 +87,19 @@ def test_spring_and_damper_of_the_kernel_are_found(spring: HandImpedance) -> Non
     assert (spring.segments, spring.segment_s) == (5, 8.0)
 
 
-def test_only_segments_count_in_which_sines_act(spring: HandImpedance) -> None:
-    """A run that goes on for 12 s after its sines, with the same spring at the same arm."""
+def test_only_segments_with_active_sines_count(spring: HandImpedance) -> None:
+    """A run that continues for 12 s after its sines, with the same spring at the same arm."""
     changes = moved_from("m1", 2.0, 40.0)
     changes["sites.m1.hands"] = [
         SPRING,
-        *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"]),
+        *({**hand, "end_s": 28.0} for hand in changes["sites.m1.hands"]),
     ]
-    found = identify_hand(tn.simulate("free", changes))
-    assert found.segments == spring.segments
-    assert np.allclose(found.K, spring.K, atol=1e-6)
+    identified_hand = identify_hand(tn.simulate("free", changes))
+    assert identified_hand.segments == spring.segments
+    assert np.allclose(identified_hand.K, spring.K, atol=1e-6)
 
 
-def test_found_hand_is_one_of_a_scenario(spring: HandImpedance) -> None:
+def test_an_identified_hand_works_in_a_scenario(spring: HandImpedance) -> None:
     hand = spring.to_hand()
     scenario = tn.load_scenario("free", {"sites.m1.hands": [hand]})
     assert scenario.sites["m1"].hands[0].stiffness_n_m == tuple(hand["stiffness_n_m"])
@@ -112,16 +115,16 @@ def test_json_of_a_hand_is_read_again(spring: HandImpedance, tmp_path: Path) -> 
     assert spring.summary().count(" +- ") == 12
 
 
-def test_mass_hidden_by_its_own_motion_is_found_over_networks() -> None:
-    true, found = held(3, 40.0)
-    assert covered(true, found).mean() >= 0.75
-    assert np.allclose(found.M, true.M, atol=0.2)
-    assert {len(one) for one in dataclasses.asdict(found)["halves"].values()} == {2}
+def test_mass_behind_own_motion_is_identified_over_networks() -> None:
+    true, identified = identify_drawn_hand(3, 40.0)
+    assert covered(true, identified).mean() >= 0.75
+    assert np.allclose(identified.M, true.M, atol=0.2)
+    assert {len(half) for half in dataclasses.asdict(identified)["halves"].values()} == {2}
 
 
 @pytest.mark.long
 def test_intervals_hold_nine_tenths_of_twenty_hands() -> None:
-    assert np.mean([covered(*held(seed, 52.0)) for seed in range(1, 21)]) >= 0.9
+    assert np.mean([covered(*identify_drawn_hand(seed, 52.0)) for seed in range(1, 21)]) >= 0.9
 
 
 @pytest.mark.parametrize(
@@ -131,7 +134,7 @@ def test_intervals_hold_nine_tenths_of_twenty_hands() -> None:
         (moved_from("s", 5.0, 6.0), "m1: the log has 0 whole segments of 8 s .* at least 28 s"),
     ],
 )
-def test_a_run_that_tells_nothing_is_refused(changes: dict[str, Any], problem: str) -> None:
+def test_a_run_without_excitation_is_refused(changes: dict[str, Any], problem: str) -> None:
     log = tn.simulate("free", {"duration_s": 1.0, "rate_hz": 250, **changes})
     with pytest.raises(UsageError, match=problem):
         identify_hand(log, "m1")

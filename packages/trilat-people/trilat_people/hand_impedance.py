@@ -66,7 +66,7 @@ UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 """Unit of each matrix."""
 
 
-class SineResponse(NamedTuple):
+class _SineResponse(NamedTuple):
     """Response of the hand and the arm to one of the sines that shake the arm.
 
     To identify the hand that holds an arm, small forces of several frequencies act on the arm.
@@ -114,7 +114,7 @@ class HandImpedance(Result):
     halves: dict[str, Array]
     segments: int
     segment_s: float
-    responses: tuple[SineResponse, ...]
+    responses: tuple[_SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Converts the identified hand to plain values for a JSON file.
@@ -196,7 +196,7 @@ class HandImpedance(Result):
         return TextTable(("", *heads), rows, align="lr")
 
 
-def _format_response(response: SineResponse) -> tuple[str, ...]:
+def _format_response(response: _SineResponse) -> tuple[str, ...]:
     """Returns the numbers of a response as texts with three digits."""
     return tuple(f"{value:.3g}" for value in response)
 
@@ -282,7 +282,7 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
 
 def _list_responses(
     F: Complex, X: Complex, hz: Array, unexplained: Array
-) -> tuple[SineResponse, ...]:
+) -> tuple[_SineResponse, ...]:
     """Returns the response at each frequency, averaged over the segments.
 
     Args:
@@ -298,9 +298,9 @@ def _list_responses(
     motion_mm = 1e3 * np.linalg.norm(mean_motion, axis=1)
     mean_force = F.mean(axis=0)
     force_n = np.linalg.norm(mean_force, axis=1)
-    responses: list[SineResponse] = []
+    responses: list[_SineResponse] = []
     for index, frequency_hz in enumerate(hz):
-        response = SineResponse(
+        response = _SineResponse(
             hz=float(frequency_hz),
             motion_mm=float(motion_mm[index]),
             force_n=float(force_n[index]),

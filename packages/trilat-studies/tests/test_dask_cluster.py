@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
-from sweep_tests.quick import asked as plan
+from sweep_tests.quick import SHORT, plan_quick_sweep
 from trial_tests.results import quick
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
@@ -34,7 +33,7 @@ ROOT = Path(trilat_net.__file__).resolve().parents[1]
 
 
 class Cluster:
-    """A scheduler and workers, each a process of its own."""
+    """A scheduler and its workers, each a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -46,14 +45,14 @@ class Cluster:
             and json.loads(file.read_text())["address"]
         )
 
-    def _start(self, *words: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
+    def _start(self, *arguments: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
         log = (self.folder / f"{len(self.processes)}.log").open("wb")
         command = [
             sys.executable,
             "-P",
             "-m",
             "dask",
-            *words,
+            *arguments,
             "--host",
             "127.0.0.1",
             "--no-dashboard",
@@ -70,7 +69,7 @@ class Cluster:
         return process
 
     def add_worker(self, path: Path = ROOT) -> "subprocess.Popen[bytes]":
-        """Starts a worker of one thread, without a nanny: one that is killed stays dead."""
+        """Starts a worker of one thread without a nanny, so that a killed worker is not restarted."""
         return self._start("worker", self.address, "--nthreads", "1", "--no-nanny", path=path)
 
     def close(self) -> None:
@@ -81,15 +80,19 @@ class Cluster:
 
 @pytest.fixture
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    made = Cluster(tmp_path_factory.mktemp("cluster"))
-    yield made
-    made.close()
+    cluster_made = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield cluster_made
+    cluster_made.close()
 
 
 def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
-    """A sweep on two workers, of which one is killed half way, and the same sweep in this process."""
+    """Returns a sweep on two workers, one of which is killed half way, and the same sweep in
+    this process.
+    """
     (folder / "trio.toml").write_text(SHORT.replace("duration_s = 0.5", "duration_s = 4.0"))
-    sweep = plan(folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0)
+    sweep = plan_quick_sweep(
+        folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0
+    )
     assert sweep.cells == count
     alone = run_sweep(prepare_sweep_folder(sweep, folder / "alone"), 1)
     killed, *_ = [cluster.add_worker() for _ in range(2)]
@@ -121,20 +124,20 @@ def workers_of(cluster: Cluster) -> int:
 
 @pytest.mark.long
 @pytest.mark.timeout(120)
-def test_a_sweep_with_a_killed_worker_gives_the_same_bytes(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_losing_a_worker_changes_no_byte(cluster: Cluster, tmp_path: Path) -> None:
     run_on_cluster(cluster, tmp_path, 300)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_so_does_one_of_2000_cells(cluster: Cluster, tmp_path: Path) -> None:
+def test_losing_a_worker_of_2000_cells_changes_nothing(
+    cluster: Cluster, tmp_path: Path
+) -> None:
     run_on_cluster(cluster, tmp_path, 2000)
 
 
 @pytest.mark.long
-def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Path) -> None:
+def test_trials_margins_and_tuning_run_on_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     cluster.add_worker()
     (tmp_path / "trio.toml").write_text(SHORT)
     on = ("--on", cluster.address)
@@ -159,17 +162,17 @@ def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Pat
             tmp_path / f"there{file}"
         ).read_bytes()
     batch = trilat_net.trials(quick(), [5, 2, 9])
-    here, there = (
+    here_results, cluster_results = (
         trilat_net.check(quick(), [5, 2, 9], **how) for how in ({"jobs": 1}, {"on": on[1]})
     )
-    assert [result.outcomes for result in here.results] == [
-        result.outcomes for result in there.results
+    assert [result.outcomes for result in here_results.results] == [
+        result.outcomes for result in cluster_results.results
     ]
-    assert len(batch) == len(there.results)
+    assert len(batch) == len(cluster_results.results)
 
 
 @pytest.mark.long
-def test_a_worker_with_another_program_is_refused_even_later(
+def test_workers_with_another_program_are_refused_even_later(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     shutil.copytree(
@@ -180,7 +183,7 @@ def test_a_worker_with_another_program_is_refused_even_later(
     with (tmp_path / "trilat_net" / "errors.py").open("a") as file:
         file.write("# another one\n")
     first = cluster.add_worker()
-    here = describe_worker()["source files"]
+    sources = describe_worker()["source files"]
     with open_worker_pool(None, cluster.address) as pool:
         assert pool.map(abs, [-1, -2]) == [1, 2]
         cluster.add_worker(tmp_path)
@@ -188,18 +191,18 @@ def test_a_worker_with_another_program_is_refused_even_later(
         first.kill()
         with pytest.raises(
             UsageError,
-            match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {here}",
+            match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {sources}",
         ):
             pool.map(abs, range(-99, 0))
     with (
-        pytest.raises(UsageError, match=f"source files .* {here}"),
+        pytest.raises(UsageError, match=f"source files .* {sources}"),
         open_worker_pool(None, cluster.address),
     ):
         pass
 
 
 @pytest.mark.long
-def test_a_worker_without_the_file_of_a_law_is_refused(
+def test_a_worker_without_the_laws_file_is_refused(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copy(ROOT / "tests" / "golden" / "spring_law.py", tmp_path / "lonely_law.py")
@@ -212,14 +215,17 @@ def test_a_worker_without_the_file_of_a_law_is_refused(
         trilat_net.check(scenario, on=cluster.address)
 
 
-def test_what_differs_is_named_on_both_sides() -> None:
-    here = describe_worker()
-    assert explain_unfit_worker(WorkerRequirements(here), here, []) == ""
+def test_differences_are_named_on_both_sides() -> None:
+    worker = describe_worker()
+    assert explain_unfit_worker(WorkerRequirements(worker), worker, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
-        text = explain_unfit_worker(WorkerRequirements(here), {**here, name: "other"}, [])
-        assert f"has {name} other, but the study needs {name} {here[name]}" in text
-    assert explain_unfit_worker(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
-    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(here), here, ["a.b:Law"])
+        text = explain_unfit_worker(WorkerRequirements(worker), {**worker, name: "other"}, [])
+        assert f"has {name} other, but the study needs {name} {worker[name]}" in text
+    assert (
+        explain_unfit_worker(WorkerRequirements(worker), {**worker, "commit": "other"}, [])
+        == ""
+    )
+    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(worker), worker, ["a.b:Law"])
 
 
 @pytest.mark.long

@@ -1,4 +1,6 @@
-"""An experiment as a Gymnasium environment: checked by it, a function of its seed, and saved as logs."""
+"""An experiment as a Gymnasium environment: passes the checker, is a function of its seed, and
+is saved as logs.
+"""
 
 import math
 import re
@@ -29,7 +31,7 @@ BENT = {f"sites.{name}.q0_rad": [0.4, 1.2] for name in ("m1", "m2", "s")}
 
 
 def episode(env: Any, seed: int, steps: int = 25) -> tuple[list[Any], list[float]]:
-    """Observations and rewards of an episode whose actions are a function of what is observed."""
+    """Observations and rewards of an episode whose actions are a function of the observations."""
     observation, _ = env.reset(seed=seed)
     seen, rewards = [observation], []
     for n in range(steps):
@@ -58,10 +60,10 @@ def test_gymnasiums_checker_finds_nothing(mode: str) -> None:
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized")
 @pytest.mark.parametrize("flat", [pytest.param(False, marks=pytest.mark.long), True])
 def test_gymnasiums_checker_renders_as_well(flat: bool) -> None:
-    made = gymnasium.make(
+    environment = gymnasium.make(
         ENV_ID, scenario="paper", set=BENT, duration_s=1, render_mode="rgb_array", flat=flat
     )
-    check_env(made.unwrapped)
+    check_env(environment.unwrapped)
 
 
 def test_an_episode_is_a_function_of_its_seed() -> None:
@@ -90,7 +92,7 @@ def test_the_vector_form_gives_the_same_bits() -> None:
     several.close()
 
 
-def test_an_episode_is_saved_as_a_log_that_verifies(tmp_path: Path) -> None:
+def test_a_saved_episode_is_a_log_that_verifies(tmp_path: Path) -> None:
     env = tn.make_env("paper", duration_s=1, vary=VARY)
     with pytest.raises(UsageError, match="once it has a step"):
         env.save(tmp_path / "none.mcap")
@@ -103,8 +105,8 @@ def test_an_episode_is_saved_as_a_log_that_verifies(tmp_path: Path) -> None:
         env.save(tmp_path / "episode.mcap")
 
 
-def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> None:
-    """So that a dataset takes the action of the program, also at equal shares."""
+def test_saved_episodes_name_a_program_as_mover(tmp_path: Path) -> None:
+    """A dataset can so take the action of the program, also at equal shares."""
     env = tn.make_env("paper", BENT, user="m2", duration_s=1)
     episode(env, 3, steps=5)
     log = tn.open_log(env.save(tmp_path / "episode.mcap"))
@@ -120,7 +122,7 @@ def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("vary", "words"),
+    ("vary", "phrase"),
     [
         ({"link.dely_ms": (0.0, 300.0)}, "did you mean 'delay_ms'"),
         ({"link.delay_ms": (0.0, -300.0)}, "delay_ms: expected a number >= 0.0"),
@@ -133,9 +135,9 @@ def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> No
     ],
 )
 def test_varied_keys_are_checked_before_the_first_episode(
-    vary: dict[str, Any], words: str
+    vary: dict[str, Any], phrase: str
 ) -> None:
-    with pytest.raises((ScenarioError, UsageError), match=words):
+    with pytest.raises((ScenarioError, UsageError), match=phrase):
         tn.make_env("paper", BENT, duration_s=1, vary=vary)
 
 
@@ -179,7 +181,7 @@ def test_clipped_actions_are_counted_and_warned_of_once(*, normalize: bool) -> N
     assert env.reset()[1]["clipped_actions"] == 0
 
 
-def test_delay_is_what_the_user_knows_by() -> None:
+def test_the_user_sees_the_slave_with_delay() -> None:
     env = tn.make_env("paper", duration_s=1)
     observation, _ = env.reset(seed=1, options={"link.delay_ms": 240})
     for _ in range(20):
@@ -204,20 +206,20 @@ def test_episodes_end_at_their_duration() -> None:
 
 
 class Still(ReachTask):
-    """Is done at once."""
+    """A task that is done at once."""
 
     def judge(self, scene: Scene) -> Judgement:  # noqa: ARG002 - as all tasks
         return Judgement(2.0, succeeded=True)
 
 
-def test_a_task_of_ones_own_judges() -> None:
+def test_a_users_own_task_judges() -> None:
     env = tn.make_env("paper", duration_s=1, task=Still())
     env.reset(seed=1)
     _, reward, ended, _, info = env.step(env.action_space.sample())
     assert (reward, ended, info["success"]) == (2.0, True, True)
 
 
-def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
+def test_reach_draws_places_evenly_and_detects_staying() -> None:
     task, random = ReachTask(radius_m=0.3), np.random.default_rng(1)
     start = np.array([1.0, 0.5])
     scene = Scene(0.0, {}, {"s": start}, None, {})  # type: ignore[arg-type]
@@ -225,9 +227,9 @@ def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
     for _ in range(2000):
         task.begin(random, scene)
         goals.append(task.goal - start)
-    apart = np.linalg.norm(goals, axis=1)
-    assert apart.max() <= 0.3
-    assert np.mean(apart < 0.15) == pytest.approx(0.25, abs=0.03)
+    distances = np.linalg.norm(goals, axis=1)
+    assert distances.max() <= 0.3
+    assert np.mean(distances < 0.15) == pytest.approx(0.25, abs=0.03)
     there = [
         scene._replace(t_s=t_s, end_effector_m={"s": task.goal}) for t_s in (0.1, 0.2, 0.3)
     ]
@@ -242,12 +244,12 @@ def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
         ({"leads": "nobody"}, "nobody"),
     ],
 )
-def test_an_environment_that_cannot_be_is_refused(keys: dict[str, Any], problem: str) -> None:
+def test_an_impossible_environment_is_refused(keys: dict[str, Any], problem: str) -> None:
     with pytest.raises((UsageError, ScenarioError), match=problem):
         tn.make_env("paper", **keys)
 
 
-def test_an_action_that_is_none_is_refused() -> None:
+def test_an_invalid_action_is_refused() -> None:
     env = tn.make_env("paper", duration_s=1)
     env.reset(seed=1)
     with pytest.raises(UsageError, match="is not finite"):
@@ -256,8 +258,8 @@ def test_an_action_that_is_none_is_refused() -> None:
         tn.make_env("paper", duration_s=1).step(np.zeros(3))
 
 
-def test_a_valid_action_works_after_refused_ones() -> None:
-    """The refused ones leave no trace: the episode equals one without them."""
+def test_refused_actions_leave_no_trace() -> None:
+    """The episode equals one without the refused actions."""
     env, other = (tn.make_env("paper", BENT, user="m2", duration_s=1) for _ in range(2))
     env.reset(seed=1)
     other.reset(seed=1)
@@ -336,7 +338,7 @@ def _first_master(scenario: str) -> str:
     return next(name for name in tn.load_scenario(scenario).names if name != "s")
 
 
-def test_a_task_without_a_goal_in_reach_is_refused() -> None:
+def test_a_task_without_reachable_goal_is_refused() -> None:
     task = ReachTask(radius_m=0.01)
     with pytest.raises(UsageError, match=r"the task has no goal: .* start from another pose"):
         tn.make_env("paper", {"arm.l2_m": 0.5, "sites.s.q0_rad": [0.4, 0.0]}, task=task)
@@ -417,14 +419,14 @@ def test_gymnasiums_wrappers_scale_actions_and_observations() -> None:
 @pytest.mark.parametrize("flat", [False, True])
 @pytest.mark.parametrize("mode", ["tip", "joint", "force"])
 def test_normalized_environments_pass_the_checker(mode: str, flat: bool) -> None:
-    """Without a warning, which the checker gives of an action space that is not normalized."""
+    """The checker warns of an action space that is not normalized; no warning is given here."""
     env = tn.make_env("paper", BENT, mode=mode, duration_s=1, flat=flat, normalize=True)
     check_env(env, skip_render_check=True)
     assert env.action_space.high.tolist() == 2 * [1.0]
 
 
 @pytest.mark.parametrize("mode", ["tip", "joint", "force"])
-def test_normalized_episodes_are_the_scaled_ones(mode: str) -> None:
+def test_normalized_episodes_equal_scaled_ones(mode: str) -> None:
     """The same actions in other units give the same numbers, none of which is clipped here."""
     env, scaled = (
         tn.make_env("paper", BENT, mode=mode, duration_s=1, flat=True, normalize=normalize)

@@ -1,4 +1,4 @@
-"""Means over seeds: what is drawn spreads them, and their intervals hold the truth as often as they say."""
+"""Means over seeds: random draws spread them, and their intervals have the stated coverage."""
 
 import json
 import shlex
@@ -55,16 +55,20 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_an_interval_holds_the_truth_in_95_of_100_cases() -> None:
+def test_intervals_hold_the_truth_in_95_of_100() -> None:
     draws = np.random.default_rng(1).normal(3.0, 1.0, (2000, 5))
-    found = [mean_interval(row.tolist()) for row in draws]
-    holds = [abs(one.mean - 3.0) <= one.half for one in found if one is not None]
+    intervals = [mean_interval(row.tolist()) for row in draws]
+    holds = [
+        abs(interval.mean - 3.0) <= interval.half
+        for interval in intervals
+        if interval is not None
+    ]
     assert len(holds) == 2000
     assert 0.93 < np.mean(holds) < 0.97
     assert mean_interval([1.0]) is mean_interval([1.0, None]) is None
 
 
-def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
+def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:
     report = run_trials(trials(file, SEEDS), jobs=1)
     (row,) = report.rows()
     values = [result.outcomes[0].value for result in report.results]
@@ -76,18 +80,20 @@ def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
     assert report.results[-1].trial.scenario == again
 
 
-def test_trial_of_distribution_names_command_that_repeats_it(file: Path) -> None:
+def test_trial_of_distribution_names_its_repeating_command(file: Path) -> None:
     trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
-    words = shlex.split(trial.look)
-    settings = [words[n + 1] for n, word in enumerate(words) if word == "--set"]
+    arguments = shlex.split(trial.look)
+    settings = [arguments[n + 1] for n, word in enumerate(arguments) if word == "--set"]
     assert (
-        load_scenario(words[2], [*settings, f"seed={words[words.index('--seed') + 1]}"])
+        load_scenario(
+            arguments[2], [*settings, f"seed={arguments[arguments.index('--seed') + 1]}"]
+        )
         == trial.scenario
     )
     assert len(set(trial.scenario.sites["m"].control.d)) == 2
 
 
-def test_a_swept_cell_has_the_means_of_its_seeds(file: Path) -> None:
+def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
     plan = plan_sweep(file, over=["link.delay_ms=20,50"], seeds=list(SEEDS), longest_s=2.0)
     results = run_sweep(prepare_sweep_folder(plan, file.parent / "o"), 1).results
     point = collect_grid_points(results)[1]
@@ -113,7 +119,7 @@ def test_a_candidate_is_the_mean_of_its_seeds(file: Path) -> None:
         ]
         alone = [measure_candidate(text, None) for text in texts]
         assert score == average_scores(alone)
-        assert score.error_rad == pytest.approx(np.mean([one.error_rad for one in alone]))
+        assert score.error_rad == pytest.approx(np.mean([single.error_rad for single in alone]))
         assert score.error_half_rad > 0.0
 
 
@@ -122,13 +128,13 @@ def test_the_outcome_of_a_candidate_is_its_worst() -> None:
     diverged = msgspec.structs.replace(
         settled, outcome=CandidateClass.DIVERGED, error_rad=None, diverged_s=1.0
     )
-    found = average_scores([settled, diverged])
-    assert (found.outcome, found.error_rad, found.diverged_s) == (
+    score = average_scores([settled, diverged])
+    assert (score.outcome, score.error_rad, score.diverged_s) == (
         CandidateClass.DIVERGED,
         None,
         1.0,
     )
-    assert found.effort_nm == 2.0
+    assert score.effort_nm == 2.0
 
 
 def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
@@ -140,9 +146,9 @@ def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
         "sim", file.name, "--set", "link.delay_ms=60", "-o", "4.mcap", cwd=file.parent
     ).succeeds()
     text = trilat("compare", "1.mcap", "2.mcap", "3.mcap", "--json", cwd=file.parent).succeeds()
-    found = json.loads(text)
-    row = next(row for row in found["rows"] if row["key"] == "rms_error_rad")
-    assert found["means"]["rms_error_rad"] == mean_interval(row["values"])._asdict()
+    facts = json.loads(text)
+    row = next(row for row in facts["rows"] if row["key"] == "rms_error_rad")
+    assert facts["means"]["rms_error_rad"] == mean_interval(row["values"])._asdict()
     assert "means" not in json.loads(
         trilat("compare", "1.mcap", "4.mcap", "--json", cwd=file.parent).succeeds()
     )

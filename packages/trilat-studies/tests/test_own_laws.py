@@ -1,4 +1,4 @@
-"""Laws of one's own in studies: given as classes, in scenarios that are tables, or loaded."""
+"""Users' own laws in studies: given as classes, in scenarios that are tables, or loaded."""
 
 from pathlib import Path
 from typing import Any
@@ -62,13 +62,13 @@ def test_ranges_come_from_the_class() -> None:
         ("K", "N m/rad", 5.0, 50.0, ""),
         ("d", "N m s/rad", 1.0, 20.0, ""),
     ]
-    told = space.controls(
+    controls = space.controls(
         tn.load_scenario("free"), build_model_information(90.0), {"K": 7.0, "d": 2.0}
     )
-    assert told["s"] == {"law": "tests.own_laws:PD", "K": 7.0, "d": 2.0, "gravity": 0.9}
+    assert controls["s"] == {"law": "tests.own_laws:PD", "K": 7.0, "d": 2.0, "gravity": 0.9}
 
 
-def test_ranges_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_ranges_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in ((3.0, 1.0), (0.0, 1.0), "wide", (1.0, 2.0, 3.0), (1.0,)):
         monkeypatch.setattr(PD, "tune", {"K": entry})
         with pytest.raises(UsageError, match=r"tune\['K'\] must be"):
@@ -76,11 +76,11 @@ def test_ranges_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.long
-def test_a_users_law_is_tuned_and_swept_as_built_in(tmp_path: Path) -> None:
-    """The same numbers: it computes what p_d does, and both get the same candidates."""
-    found = tn.tune("free", [CompiledPD, "p_d"], budget=2, duration_s=2, jobs=1)
-    ours, theirs = (one.scores for one in found.found)
-    assert found.found[0].space.law == "tests.own_laws:CompiledPD"
+def test_users_laws_are_tuned_like_built_in_ones(tmp_path: Path) -> None:
+    """The user's law computes p_d, so both laws get the same numbers."""
+    tuning = tn.tune("free", [CompiledPD, "p_d"], budget=2, duration_s=2, jobs=1)
+    ours, theirs = (law.scores for law in tuning.found)
+    assert tuning.found[0].space.law == "tests.own_laws:CompiledPD"
     assert all(score.error_rad is not None for score in [*ours, *theirs])
     swept = tn.sweep(
         "p_d_margin",
@@ -97,5 +97,5 @@ def test_a_users_law_is_tuned_and_swept_as_built_in(tmp_path: Path) -> None:
         tn.load_scenario("p_d_margin"), "control.d=0.2:3", laws=[CompiledPD, "p_d"], tolerance=0.2, jobs=1,
         duration_s=4,
     )  # fmt: skip
-    ours_at, theirs_at = (one.margin.spans[0].low for one in edges.found)
+    ours_at, theirs_at = (edge.margin.spans[0].low for edge in edges.found)
     assert ours_at == theirs_at

@@ -5,7 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
-from sweep_tests.maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
+from sweep_tests.maps import (
+    DAMPINGS,
+    DELAYS_MS,
+    KEYS,
+    P_D,
+    judge_by_condition,
+    make_plane,
+    rows,
+)
 from trilat_studies.bench import plan_bench, prepare_bench_folder, run_bench
 from trilat_studies.bench.bench_figures import FIGURES_OF_BENCH, write_bench
 from trilat_studies.sweep.map_page import write_map
@@ -19,14 +27,14 @@ pytestmark = needs_browser
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
 LINE = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
-UNEVEN = drawn()
+UNEVEN = make_plane()
 PLANES: dict[str, MapPlane] = {
-    "verdicts": drawn(),
-    "panels": drawn(link__playout_ms=(0.0, 400.0)),
-    "six panels": drawn(rate_hz=tuple(float(n) for n in range(1, 7))),
-    "seeds": drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4),
-    "no edge": drawn(lambda *_, **__: CellClass.CONVERGED),
-    "all diverged": drawn(lambda *_, **__: CellClass.DIVERGED),
+    "verdicts": make_plane(),
+    "panels": make_plane(link__playout_ms=(0.0, 400.0)),
+    "six panels": make_plane(rate_hz=tuple(float(n) for n in range(1, 7))),
+    "seeds": make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4),
+    "no edge": make_plane(lambda *_, **__: CellClass.CONVERGED),
+    "all diverged": make_plane(lambda *_, **__: CellClass.DIVERGED),
     "uneven axis": UNEVEN._replace(x=UNEVEN.x._replace(values=(8, 68, 136, 272, 1088))),
     "missing cell": build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D),
     "exponents": build_plane(

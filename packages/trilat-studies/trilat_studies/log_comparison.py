@@ -17,10 +17,10 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import Metric, Quantity, quantities
 from trilat_net.errors import UsageError, count_nouns, join_words
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.own_code.code_consent import may_run_user_laws
 from trilat_net.presentation.certificate_text import describe_judgement
 from trilat_net.presentation.result_text import Block, MarkedText, TextTable, format_number
 from trilat_net.results import Result
-from trilat_net.scenario.code_consent import may_run_user_laws
 from trilat_net.scenario.describe import (
     ScenarioDifference,
     compare_scenarios,

@@ -50,10 +50,10 @@ from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.presentation.result_text import Block, MarkedText, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.scenario_reader import read_experiment, reseed_scenario
 from trilat_net.work.executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
 from trilat_net.work.intervals import MeanInterval, mean_interval

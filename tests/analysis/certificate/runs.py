@@ -1,4 +1,4 @@
-"""Virtual runs with their books, each made once per test session."""
+"""Virtual runs with their energy books, each made once per test session."""
 
 import json
 from collections.abc import Mapping
@@ -140,7 +140,7 @@ TEXTS = {"rich": RICH, "wall": WALL}
 
 
 class _Run:
-    """A run, and what is made of it, each once."""
+    """A run, and the results computed from the run, each computed once."""
 
     def __init__(self, name: str, overrides: Mapping[str, Any]) -> None:
         known = name in TEXTS
@@ -168,7 +168,7 @@ _made: dict[str, _Run] = {}
 
 
 def run(name: str, overrides: Mapping[str, Any] | None = None) -> _Run:
-    """A run of a shipped scenario or of one above, made once per test session."""
+    """Returns a run of a shipped scenario or of a scenario above, made once per test session."""
     key = json.dumps([name, overrides or {}], sort_keys=True)
     if key not in _made:
         _made[key] = _Run(name, dict(overrides or {}))
@@ -176,5 +176,5 @@ def run(name: str, overrides: Mapping[str, Any] | None = None) -> _Run:
 
 
 def relative(balance: EnergyBalance) -> float:
-    """Its largest residual as a share of its largest energy."""
+    """Returns the largest residual of a balance as a share of the largest energy."""
     return float(np.abs(balance.residual).max()) / max(balance.scale, 1e-12)

@@ -1,4 +1,4 @@
-"""Whatever was run, a certificate comes of it: in words, in finite numbers, and accusing nobody."""
+"""Every run has a certificate, in words and in finite numbers, that accuses nobody."""
 
 import json
 from typing import Any
@@ -50,21 +50,24 @@ changes = st.dictionaries(st.sampled_from(sorted(CHANGES)), st.integers(0, 2), m
 
 @settings(max_examples=25)
 @given(st.sampled_from(SCENARIOS), changes, st.sampled_from([0.02, 0.5, 1.5]))
-def test_every_run_is_certified(name: str, picks: dict[str, int], duration_s: float) -> None:
+def test_every_run_has_a_certificate(
+    name: str, picks: dict[str, int], duration_s: float
+) -> None:
     overrides = {key: CHANGES[key][pick % len(CHANGES[key])] for key, pick in picks.items()}
     try:
         scenario = load_scenario(name, {"rate_hz": 100, "duration_s": duration_s, **overrides})
     except ScenarioError:
         return
-    found = certify(trilat_net.simulate(scenario))
-    told = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert FALSE_RECORDS_TEXT not in told["text"] or "tells which" in told["text"]
+    certificate = certify(trilat_net.simulate(scenario))
+    facts = json.loads(json.dumps(certificate.to_dict(), allow_nan=False))
+    assert FALSE_RECORDS_TEXT not in facts["text"] or "tells which" in facts["text"]
     assert all(
-        line.text and "nan" not in line.text.split() for line in describe_certificate(found)
+        line.text and "nan" not in line.text.split()
+        for line in describe_certificate(certificate)
     )
-    assert found.passed is (describe_certificate(found)[0].mark == "ok")
-    if found.balance is not None:
-        (_, first), *between, (_, last) = list_energies(found.balance)
+    assert certificate.passed is (describe_certificate(certificate)[0].mark == "ok")
+    if certificate.balance is not None:
+        (_, first), *between, (_, last) = list_energies(certificate.balance)
         assert first + sum(x for _, x in between) == pytest.approx(
-            last, abs=2e-5 * found.balance.scale + 1e-9
+            last, abs=2e-5 * certificate.balance.scale + 1e-9
         )

@@ -1,8 +1,8 @@
-"""The energy balance closes, to the order of what made the log, and only with every term as it is.
+"""The energy balance closes, to the order of the integrator, and only with every term as
+derived.
 
-The energy balance of arms of n joints closes, with friction, stops, walls in space and limits too.
-
-The energy balance of sites that follow with their end effectors closes, and needs every term.
+The balance of arms of n joints closes with friction, stops, walls in space and limits. The
+balance of sites that follow with their end effectors closes, and needs every term.
 """
 
 import dataclasses
@@ -56,24 +56,24 @@ def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
 @pytest.mark.parametrize(
     "name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"]
 )
-def test_the_balance_closes_to_2e_5_with_order_two(name: str) -> None:
+def test_balance_closes_to_2e_5_with_second_order(name: str) -> None:
     assert of_largest_v(runs.run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
     assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
 
 
-def test_it_closes_until_both_hands_have_let_go() -> None:
+def test_balance_closes_until_both_hands_let_go() -> None:
     """At a tenth of the rate a hundred times the error is allowed."""
     assert of_largest_v(runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
 
 
-def test_digital_closes_to_some_percent_with_order_one() -> None:
+def test_digital_closes_to_some_percent_with_first_order() -> None:
     b = runs.run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
     assert of_largest_v(b) == pytest.approx(3.2e-2, rel=0.2)
     assert order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
     assert np.abs(b.unexplained).max() <= 4e-5 * b.scale
 
 
-def test_jitter_closes_to_1e_4_with_its_jumps_booked() -> None:
+def test_jitter_closes_to_1e_4_with_booked_jumps() -> None:
     b = runs.run("free", runs.JITTER).balance
     links = np.sum([x for name, x in b.work.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
@@ -82,14 +82,16 @@ def test_jitter_closes_to_1e_4_with_its_jumps_booked() -> None:
 
 
 def test_jitter_is_of_order_one_at_least() -> None:
-    """Of some seeds together: which jumps a run has is a matter of its draws; errors cancel to order 1.5."""
+    """Over some seeds together: the jumps of a run depend on its draws, and errors cancel to order 1.5."""
     seeds = [{**runs.JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
     orders = [order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
 
 
-def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
-    """Arms that brake: e and its derivative jump at once, and the torque that is held is that of before."""
+def test_sampling_error_across_jumps_is_second_order() -> None:
+    """Arms that brake: e and its derivative jump at once, while the held torque is the torque
+    before the jump.
+    """
     cut = {"link.loss": 1.0, "on_stale.action": "brake", "duration_s": 1.0}
     rest = [
         float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max())
@@ -102,7 +104,7 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
     ("key", "limit", "term"),
     [("tau_rate_limit_nm_s", 100.0, "torque limit"), ("qd_des_limit_rad_s", 0.5, "rule")],
 )
-def test_what_limit_of_torque_rate_or_reference_takes_is_booked(
+def test_limits_of_torque_rate_and_reference_are_booked(
     key: str, limit: float, term: str
 ) -> None:
     b = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
@@ -110,21 +112,21 @@ def test_what_limit_of_torque_rate_or_reference_takes_is_booked(
     assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
 
 
-def test_a_site_that_stops_and_goes_on_is_booked() -> None:
-    """Its torque is not that of the law, and its estimates stand still."""
+def test_a_stop_and_restart_is_booked() -> None:
+    """The torque of a stopped site is not that of the law, and the site's estimates stand still."""
     b = compute_energy_balance(compute_site_energies(stopped_log(adaptive_text(), 3000)))
     assert np.abs(b.work["torque limit"]).max() > 0.01 * b.V.max()
     assert np.abs(b.work["estimates"]).max() > 1e-3 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-4 * b.scale
 
 
-def test_a_wall_that_gives_energy_closes_to_1e_4() -> None:
+def test_sampled_walls_energy_closes_to_1e_4() -> None:
     b = runs.run("wall").balance
     assert b.work["walls"].max() > 1e-3
     assert of_largest_v(b) <= 1e-4
 
 
-def test_everything_at_once_closes_to_1e_4_at_500_hz() -> None:
+def test_all_effects_together_close_to_1e_4() -> None:
     b = runs.run("rich").balance
     assert of_largest_v(b) <= 1e-4
     assert all(
@@ -149,7 +151,7 @@ TERMS = [
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0])
 @pytest.mark.parametrize(("name", "group", "term"), TERMS, ids=lambda value: str(value))
-def test_any_one_term_with_another_sign_or_factor_is_caught(
+def test_a_wrong_sign_or_factor_is_detected(
     name: str, group: str, term: str, factor: float
 ) -> None:
     b = runs.run(name, runs.JITTER if name == "free" else None).balance
@@ -157,8 +159,11 @@ def test_any_one_term_with_another_sign_or_factor_is_caught(
     assert runs.relative(replace(b, **{group: terms})) > CAUGHT > 5 * runs.relative(b)
 
 
-def test_ones_for_beta_is_caught_and_named() -> None:
-    """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
+def test_beta_of_ones_is_detected_and_named() -> None:
+    """The paper sets beta = (1, 1, 1) after Eq.
+
+    (20), which is the right null vector of Upsilon, not the left one.
+    """
     ones = compute_energy_balance(
         runs.run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies,
         paper_weights=True,
@@ -167,7 +172,7 @@ def test_ones_for_beta_is_caught_and_named() -> None:
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
-def test_v_with_the_papers_weights_rises_the_corrected_one_never() -> None:
+def test_v_rises_with_the_papers_weights_only() -> None:
     books = runs.run("free", runs.LYAPUNOV).energies
     ones, right = (
         compute_energy_balance(books, paper_weights=True),
@@ -180,12 +185,14 @@ def test_v_with_the_papers_weights_rises_the_corrected_one_never() -> None:
 
 
 @pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.long), "asymmetric"])
-def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
-    """`tests/theory/energy.py` knows one constant delay per link and nothing else; there both must agree."""
+def test_balance_equals_an_independent_book(name: str) -> None:
+    """`tests/theory/energy.py` allows one constant delay per link and nothing else; for such
+    runs both must agree.
+    """
     overrides = {"duration_s": 2.5, "rate_hz": 500}
-    made = run(name, overrides)
+    run_of_program = run(name, overrides)
     theirs, ours = (
-        balance_by_hand(made, left_null_vector(made.scenario) * 3),
+        balance_by_hand(run_of_program, left_null_vector(run_of_program.scenario) * 3),
         runs.run(name, overrides).balance,
     )
     close = {"abs": 1e-12 * float(theirs.V.max())}
@@ -194,26 +201,28 @@ def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
     assert sum(ours.work.values()) == pytest.approx(theirs.given, **close)
 
 
-def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
-    """V, dissipation and work of the continuous equations: DOP853 and Gauss-Legendre, nothing of ours."""
+def test_v_converges_to_the_exact_functional() -> None:
+    """V, dissipation and work of the continuous equations: DOP853 and Gauss-Legendre, no code
+    of the program.
+    """
     scenario = load_scenario("paper", {"duration_s": 2.0})
     exact = equations(scenario).solve(2.0)
     ours = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000}).balance
     for t in (0.5, 1.2, 1.9):
         k = round(t * 1000)
         assert float(ours.V[k]) == pytest.approx(_exact_v(exact, t), abs=3e-4)
-        taken, given = _exact_integrals(exact, t)
+        taken, work = _exact_integrals(exact, t)
         assert sum(float(x[k]) for x in ours.dissipation.values()) == pytest.approx(
             taken, abs=3e-4
         )
-        assert float(ours.work["hands"][k]) == pytest.approx(given, abs=3e-4)
-        assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - given == pytest.approx(
+        assert float(ours.work["hands"][k]) == pytest.approx(work, abs=3e-4)
+        assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - work == pytest.approx(
             0.0, abs=1e-7
         )
 
 
 def _gauss(f, a: float, b: float, edges: list[float]) -> float:
-    """Integral of a function of times, with no panel across an edge."""
+    """Returns the integral of a function of time, with no panel across an edge."""
     x, w = np.polynomial.legendre.leggauss(12)
     cuts = sorted({a, b, *(float(e) for e in edges if a < e < b)})
     total = 0.0
@@ -253,15 +262,19 @@ def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
         qd = now[..., 2:4]
         e = now[..., :2] - np.einsum("ij,jtn->itn", exact.alpha, then[..., :2])
         r = qd + exact.Lambda * e
-        apart = (exact.Kd * (qd[:, np.newaxis] - then[np.newaxis, ..., 2:4]) ** 2).sum(-1)
-        lost = (exact.Kp * r**2).sum((0, 2)) + 0.5 * np.einsum("ij,ijt->t", exact.alpha, apart)
+        disagreement = (exact.Kd * (qd[:, np.newaxis] - then[np.newaxis, ..., 2:4]) ** 2).sum(
+            -1
+        )
+        lost = (exact.Kp * r**2).sum((0, 2)) + 0.5 * np.einsum(
+            "ij,ijt->t", exact.alpha, disagreement
+        )
         pushed = np.stack([exact.hands(s) for s in times], axis=1)
         return lost, (r * pushed).sum((0, 2))
 
     return tuple(_gauss(lambda s, n=n: powers(s)[n], 0.0, t, PANELS) for n in (0, 1))  # type: ignore[return-value]
 
 
-def test_a_closed_group_is_balanced_by_itself() -> None:
+def test_a_closed_group_balances_alone() -> None:
     """m1 and m2 follow each other alone; s follows both and has no part in their balance."""
     pair = {
         "dominance.m1.m2": 1.0,
@@ -285,24 +298,27 @@ def unexplained(balance: EnergyBalance) -> float:
 
 
 def check_six(duration_s: float) -> LogMetrics:
-    """The certificate of a run of six joints, and its metrics."""
+    """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joints(duration_s, 200.0)))
-    found, metrics = certify(log), compute_log_metrics(log)
-    assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
-    assert found.balance is not None
-    assert unexplained(found.balance) <= BAR
-    assert np.abs(found.balance.residual).max() <= BAR * found.balance.V.max()
-    for site, energy in found.energies.items():
-        own = metrics.sites[site]
-        learnt = own["theta_energy_last_j"].value - own["theta_energy_first_j"].value
+    certificate, metrics = certify(log), compute_log_metrics(log)
+    assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
+    assert certificate.balance is not None
+    assert unexplained(certificate.balance) <= BAR
+    assert np.abs(certificate.balance.residual).max() <= BAR * certificate.balance.V.max()
+    for site, energy in certificate.energies.items():
+        figures_of_site = metrics.sites[site]
+        learnt = (
+            figures_of_site["theta_energy_last_j"].value
+            - figures_of_site["theta_energy_first_j"].value
+        )
         assert learnt == pytest.approx(
             np.ptp(energy.parts.parameter[[0, -1]]) * np.sign(learnt), rel=1e-6
         )
-        assert own["unaccounted_j"].value <= 1e-6
+        assert figures_of_site["unaccounted_j"].value <= 1e-6
     return metrics
 
 
-def test_energy_of_six_joints_closes_with_the_base_parameters() -> None:
+def test_six_joints_close_with_the_base_parameters() -> None:
     metrics = check_six(2.0)
     estimates = metrics.estimates["s"].base
     assert estimates is not None
@@ -333,16 +349,17 @@ def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
 
 
 def test_premises_name_joints_at_limits_and_at_stops() -> None:
-    found = certify(rough_log())
-    premises = {premise.name: premise for premise in found.premises}
+    certificate = certify(rough_log())
+    premises = {premise.name: premise for premise in certificate.premises}
     assert (
         premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
     )
     assert "s (shoulder_lift)" in premises["torque"].text
     assert "m2 (elbow)" in premises["stops"].text
-    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE), (
-        found.verdict.text
-    )
+    assert certificate.verdict.finding in (
+        StabilityFinding.DID_NOT_RISE,
+        StabilityFinding.ROSE,
+    ), certificate.verdict.text
 
 
 def test_every_term_of_a_rough_arm_is_needed() -> None:
@@ -354,21 +371,21 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
     for site, name in (("s", "friction"), ("m2", "friction"), ("m2", "stops"), ("s", "walls")):
         energy = energies[site]
         kinds = {
-            kind: {key: one for key, one in getattr(energy, kind).items() if key != name}
+            kind: {key: course for key, course in getattr(energy, kind).items() if key != name}
             for kind in ("dissipation", "work")
         }
         lame = dataclasses.replace(energy, **kinds)
         assert np.abs(lame.unexplained).max() > 50 * np.abs(energy.unexplained).max(), name
 
 
-def test_friction_and_stops_stand_in_the_energies_of_an_arm() -> None:
-    found = compute_log_metrics(rough_log())
-    for own in found.sites.values():
-        assert own["friction_j"].value > 1.0
-        assert own["unaccounted_j"].value <= 0.02
-    assert found.sites["m2"]["walls_j"].value < 0.0  # its stop
-    assert not found.sites["m1"]["walls_j"].applies
-    assert found.walls["s/1"]["force_peak_n"].value > 10.0
+def test_friction_and_stops_stand_in_arm_energies() -> None:
+    metrics = compute_log_metrics(rough_log())
+    for site in metrics.sites.values():
+        assert site["friction_j"].value > 1.0
+        assert site["unaccounted_j"].value <= 0.02
+    assert metrics.sites["m2"]["walls_j"].value < 0.0  # its stop
+    assert not metrics.sites["m1"]["walls_j"].applies
+    assert metrics.walls["s/1"]["force_peak_n"].value > 10.0
 
 
 """Largest residual as a share of the largest V."""
@@ -379,26 +396,29 @@ def judge(rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object) -> C
     return certify(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
 
 
-def share(found: Certificate, name: str = "residual") -> float:
-    assert found.balance is not None, found.verdict.text
-    return float(np.abs(getattr(found.balance, name)).max() / found.balance.V.max())
+def share(certificate: Certificate, name: str = "residual") -> float:
+    assert certificate.balance is not None, certificate.verdict.text
+    return float(np.abs(getattr(certificate.balance, name)).max() / certificate.balance.V.max())
 
 
-def test_it_closes_with_order_two() -> None:
-    found = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
-    assert all(one.verdict.finding is StabilityFinding.COVERED for one in found.values())
-    assert share(found[1000]) <= BAR
-    assert share(found[500]) / share(found[1000]) == pytest.approx(4.0, rel=0.1)
+def test_the_balance_closes_with_order_two() -> None:
+    certificates = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
+    assert all(
+        certificate.verdict.finding is StabilityFinding.COVERED
+        for certificate in certificates.values()
+    )
+    assert share(certificates[1000]) <= BAR
+    assert share(certificates[500]) / share(certificates[1000]) == pytest.approx(4.0, rel=0.1)
 
 
-def test_it_closes_with_links_that_jitter_box_and_torque_limit() -> None:
+def test_the_balance_closes_under_jitter_and_limits() -> None:
     jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
     box = judge(
         **{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2}
     )
     limit = judge(**{"limits.tau_limit_nm": 25.0})
-    for found in (jitter, box, limit):
-        assert share(found) <= BAR
+    for balanced in (jitter, box, limit):
+        assert share(balanced) <= BAR
     assert box.verdict.finding is StabilityFinding.COVERED
     assert {premise.name for premise in limit.premises if not premise.holds} == {"torque"}
     assert limit.verdict.rise is not None
@@ -406,44 +426,50 @@ def test_it_closes_with_links_that_jitter_box_and_torque_limit() -> None:
 
 
 def test_damping_near_a_singular_pose_fails_a_premise() -> None:
-    found = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
-    premise = next(one for one in found.premises if one.name == "singular poses")
+    certificate = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
+    premise = next(listed for listed in certificate.premises if listed.name == "singular poses")
     assert premise.holds is False
     assert "s from 0 s on" in premise.text
-    assert found.balance is not None
-    assert abs(found.balance.work["singular poses"][-1]) > 0.02 * found.balance.V.max()
-    assert share(found, "unexplained") <= 2e-4
+    assert certificate.balance is not None
+    assert (
+        abs(certificate.balance.work["singular poses"][-1]) > 0.02 * certificate.balance.V.max()
+    )
+    assert share(certificate, "unexplained") <= 2e-4
 
 
 @pytest.mark.long
-def test_an_axis_that_only_one_follows_dissipates() -> None:
-    """The arm of seven joints begins beside the plane of its masters, which cannot leave it."""
+def test_the_axis_of_one_arm_dissipates() -> None:
+    """The arm of seven joints starts beside the plane of its masters, and the masters cannot
+    leave that plane.
+    """
     q0 = [0.3, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
     log = trilat_net.simulate(
         load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0})
     )
-    found = certify(log)
-    assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
-    assert share(found) <= BAR
-    assert found.balance is not None
-    taken = found.balance.dissipation["open axes"]
+    certificate = certify(log)
+    assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
+    assert share(certificate) <= BAR
+    assert certificate.balance is not None
+    taken = certificate.balance.dissipation["open axes"]
     assert taken[-1] > 1e-3
     assert np.diff(taken).min() >= -1e-15
     for site, energy in compute_site_energies(log).items():
-        terms = {name: one for name, one in energy.dissipation.items() if name != "open axes"}
+        terms = {
+            name: course for name, course in energy.dissipation.items() if name != "open axes"
+        }
         lame = dataclasses.replace(energy, dissipation=terms)
         if site == "s":
             assert np.abs(lame.residual).max() > 10 * np.abs(energy.residual).max()
 
 
-def test_following_an_axis_that_peers_leave_free_fails() -> None:
-    found = judge(**{"sites.m.task.axes": ["x"]})
-    premise = next(one for one in found.premises if one.name == "axes")
+def test_following_an_axis_free_at_peers_fails() -> None:
+    certificate = judge(**{"sites.m.task.axes": ["x"]})
+    premise = next(listed for listed in certificate.premises if listed.name == "axes")
     assert premise.holds is False
     assert "s follows m" in premise.text
 
 
-def test_orientations_have_no_v_and_it_says_why() -> None:
+def test_orientations_have_no_v_for_a_reason() -> None:
     text = (
         planar_task(duration_s=0.1)
         .replace("position", "pose")

@@ -1,4 +1,4 @@
-"""Jumps are exact: what is booked is the difference of V before and after, found by computing V twice."""
+"""Jumps are exact: each booked jump is the difference of V before and after, found by computing V twice."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def moving(
 
 
 class Situation:
-    """A site at two ticks, and its peers all the time before; which samples are in use is chosen."""
+    """A site at two ticks, its peers at all earlier times, and a choice of the samples in use."""
 
     def __init__(self, seed: int, before: tuple[int, int], after: tuple[int, int]) -> None:
         random = np.random.default_rng(seed)
@@ -89,20 +89,22 @@ ticks = st.integers(1, NOW - 2)
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
-def test_work_of_links_is_what_their_jumps_change_in_v(
+def test_jumps_of_links_change_v_exactly(
     seed: int, before: tuple[int, int], after: tuple[int, int]
 ) -> None:
-    """Against the same instant with samples in use that are as old as those before: m + 1 in place of m'."""
+    """Compared with the same instant whose samples in use are as old as those before: m + 1 in
+    place of m'.
+    """
     jumped = Situation(seed, before, after)
-    kept = Situation(seed, before, (before[0] + 1, before[1] + 1))
-    change = jumped.v(1) - kept.v(1)
+    situation = Situation(seed, before, (before[0] + 1, before[1] + 1))
+    change = jumped.v(1) - situation.v(1)
     assert sum(jumped.booked()) == pytest.approx(change, rel=1e-9, abs=1e-9)
-    assert kept.booked() == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert situation.booked() == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
-def test_the_right_end_of_a_period_keeps_its_sample_ages(
+def test_sample_ages_are_kept_within_a_period(
     seed: int, before: tuple[int, int], after: tuple[int, int]
 ) -> None:
     site = Situation(seed, before, after)
@@ -119,7 +121,7 @@ def test_the_right_end_of_a_period_keeps_its_sample_ages(
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
-def test_a_held_torque_works_with_its_value_at_the_beginning(seed: int) -> None:
+def test_a_held_torque_works_with_its_initial_value(seed: int) -> None:
     site = Situation(seed, (5, 9), (6, 10))
     ends = site.motion.ends
     now, held = np.random.default_rng(seed).normal(size=(2, 2, 2))
@@ -130,7 +132,7 @@ def test_a_held_torque_works_with_its_value_at_the_beginning(seed: int) -> None:
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
-def test_a_step_of_shares_works_what_it_changes_in_v(seed: int, share: float) -> None:
+def test_a_step_of_shares_changes_v_exactly(seed: int, share: float) -> None:
     stepped, kept = (Situation(seed, (5, 9), (6, 10)) for _ in range(2))
     after = np.array([share, 1.0 - share])
     stepped.shares.alpha[1] = after
@@ -143,17 +145,19 @@ def test_a_step_of_shares_works_what_it_changes_in_v(seed: int, share: float) ->
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
-def test_slow_change_of_delay_gives_missing_term_of_theorem(seed: int) -> None:
-    """a_ij T' [ 1/2 |qd_jd|^2_Kd + (Lambda Kd e_i + Lambda M r_i)' qd_jd ], of an age that grows slowly."""
+def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
+    """a_ij T' [ 1/2 |qd_jd|^2_Kd + (Lambda Kd e_i + Lambda M r_i)' qd_jd ], for an age that
+    grows slowly.
+    """
     site = Situation(seed, (5, 9), (6, 10))
     peer = site.peers[0]
     t_s, speed = np.arange(ROWS) / RATE_HZ, np.array([0.3, -0.2])
     peer.qd[:], peer.q[:] = speed, speed * t_s[:, np.newaxis]
     peer = peer._replace(rate_hz=RATE_HZ)
     grown_s = 1e-6
-    one = view_delayed_peer(site.track, PeerTrajectory(peer))
-    later = PeerTrajectory(peer).evaluate(one.stamp_s - np.array([0.0, grown_s]))
-    site.views[0] = one._replace(delayed=later)
+    peer_view = view_delayed_peer(site.track, PeerTrajectory(peer))
+    later = PeerTrajectory(peer).evaluate(peer_view.stamp_s - np.array([0.0, grown_s]))
+    site.views[0] = peer_view._replace(delayed=later)
     site.track.q_des[1] = sum(
         a * v.delayed.q[1] for a, v in zip(site.alpha, site.views, strict=True)
     )
@@ -168,13 +172,13 @@ def test_slow_change_of_delay_gives_missing_term_of_theorem(seed: int) -> None:
     )
 
 
-def test_a_box_that_holds_the_truth_only_takes() -> None:
+def test_a_box_around_the_truth_only_dissipates() -> None:
     given_by_box = runs.run("rich").balance.work["estimates"]
     assert given_by_box[-1] < -0.1
     assert np.diff(given_by_box).max() <= 1e-12
 
 
-def test_the_torque_limit_counts_where_it_cuts() -> None:
+def test_the_torque_limit_counts_when_active() -> None:
     book = runs.run("rich").energies["s"]
     cut = (np.abs(book.motion.records.tau) >= book.motion.constants.tau_limit).any(axis=1)
     booked = book.work["torque limit"]

@@ -1,6 +1,7 @@
-"""Energies that laws declare: lines, stores and what is taken for good, judged from the records.
+"""Energies that laws declare (lines, stores and losses), judged from the records.
 
-Energies of the built-in laws that keep account of it, as the certificate books them from records alone.
+Energies of the built-in laws that account for them, as the certificate books them from records
+alone.
 """
 
 from functools import cache
@@ -60,20 +61,22 @@ damping_nm_s_rad = 10.0
 
 @cache
 def clamped(**changes: Any) -> Log:
-    """A master that a hand moves, a line, and a slave that is held."""
+    """A run of a master that a hand moves, a line, and a clamped slave."""
     overrides = {key.replace("__", "."): value for key, value in changes.items()}
     return simulate_scenario(load_scenario(load_scenario(PAIR), overrides))
 
 
-def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:
-    """b / T between the hand and what holds the slave: its energy is half its force squared times T / b."""
+def test_a_line_at_rest_is_a_spring() -> None:
+    """The spring b / T lies between the hand and the clamp of the slave: its energy is half its
+    force squared times T / b.
+    """
     log = clamped()
-    found = observe_energies(log, own_laws=True)
-    assert found.finding is ObservedFinding.PASSIVE
-    assert all(premise.holds for premise in found.premises)
-    assert {one.name for one in found.least} >= {"line m->s", "line s->m"}
-    assert min(one.amount_j for one in found.least) >= -1e-12
-    assert found.residual_j <= 1e-12 * found.largest_j
+    energies = observe_energies(log, own_laws=True)
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in energies.premises)
+    assert {energy.name for energy in energies.least} >= {"line m->s", "line s->m"}
+    assert min(energy.amount_j for energy in energies.least) >= -1e-12
+    assert energies.residual_j <= 1e-12 * energies.largest_j
     force = TO / (1 / HAND + DELAY_S / B + 1 / WALL)  # of each of two joints
     assert log["m"].tau_x[-1] == pytest.approx([-force, -force], rel=2e-3)
     waves = [log[site].sent[f"u[{peer}]"][-1] for site, peer in (("m", "s"), ("s", "m"))]
@@ -81,16 +84,17 @@ def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:
     assert stored == pytest.approx(force**2 * DELAY_S / B, rel=5e-3)
 
 
-def test_wave_that_is_held_over_outage_is_energy_from_nowhere() -> None:
-    """What is missing must be zero (Niemeyer and Slotine 2004); this law uses the last wave again and again.
+def test_waves_held_over_an_outage_add_energy() -> None:
+    """The wave of a missing sample must be zero (Niemeyer and Slotine 2004); this law uses the
+    last wave again and again.
 
-    The hand lets go in the outage, so that the master sends less than what the slave goes on using.
+    The hand lets go in the outage, so that the master sends less than the slave goes on using.
     """
     outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
     log = clamped.__wrapped__(**outage, duration_s=3.2)
-    found = certify(log, own_laws=True)
-    assert found.observed.finding is ObservedFinding.NEGATIVE
-    lowest = min(found.observed.least, key=lambda one: one.amount_j)
+    certificate = certify(log, own_laws=True)
+    assert certificate.observed.finding is ObservedFinding.NEGATIVE
+    lowest = min(certificate.observed.least, key=lambda one: one.amount_j)
     assert lowest.name == "line m->s"
     last = round(1000 * lowest.at_s) + 1
     used = log["s"].used["m"][:last]
@@ -98,14 +102,14 @@ def test_wave_that_is_held_over_outage_is_energy_from_nowhere() -> None:
     energy = 0.5 * 1e-3 * (log["m"].sent["u[s]"][:last] ** 2).sum(axis=1)
     assert times.max() > 1000
     assert lowest.amount_j == pytest.approx(((1 - times) * energy).sum(), rel=1e-9)
-    assert found.observed.text in found.reasons
-    assert found.stability is not Stability.STABLE
+    assert certificate.observed.text in certificate.reasons
+    assert certificate.stability is not Stability.STABLE
 
 
-def test_books_find_a_law_that_sends_more_than_it_got() -> None:
-    found = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
-    assert found.finding is ObservedFinding.BROKEN
-    assert found.residual_j > 1e-4
+def test_books_detect_a_law_sending_too_much() -> None:
+    energies = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
+    assert energies.finding is ObservedFinding.BROKEN
+    assert energies.residual_j > 1e-4
 
 
 def test_code_from_outside_runs_only_on_request() -> None:
@@ -116,53 +120,57 @@ def test_code_from_outside_runs_only_on_request() -> None:
     assert observe_energies(mixed, own_laws=True).text.endswith("the law of s declares none")
 
 
-def test_the_certificate_says_it_in_words_and_in_json() -> None:
-    found = certify(clamped(), own_laws=True)
-    lines = {line.text: line.mark for line in describe_certificate(found)}
-    assert lines[found.observed.text] == "ok"
-    told = found.to_dict()["observed"]
-    assert told["finding"] == "passive"
-    assert {one["name"] for one in told["premises"]} == {"books", "torque", "sampling"}
-    assert np.isfinite([one["amount_j"] for one in told["least"]]).all()
+def test_the_certificate_reports_it_in_text_and_json() -> None:
+    certificate = certify(clamped(), own_laws=True)
+    lines = {line.text: line.mark for line in describe_certificate(certificate)}
+    assert lines[certificate.observed.text] == "ok"
+    observed = certificate.to_dict()["observed"]
+    assert observed["finding"] == "passive"
+    assert {premise["name"] for premise in observed["premises"]} == {
+        "books",
+        "torque",
+        "sampling",
+    }
+    assert np.isfinite([energy["amount_j"] for energy in observed["least"]]).all()
 
 
 @cache
 def run(law: str) -> Log:
-    """A clamped slave, 200 ms each way."""
+    """A run with a clamped slave, 200 ms each way."""
     return simulate_scenario(pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
-def test_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> None:
+def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> None:
     log = run(law)
-    found = observe_energies(log)
-    assert found.finding is ObservedFinding.PASSIVE
-    assert all(premise.holds for premise in found.premises)
-    assert found.residual_j <= 1e-12 * found.largest_j
-    assert {one.name for one in found.least} >= {
+    energies = observe_energies(log)
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in energies.premises)
+    assert energies.residual_j <= 1e-12 * energies.largest_j
+    assert {energy.name for energy in energies.least} >= {
         "line m->s",
         "line s->m",
         "store of s",
         "taken by s",
     }
-    given = next(one for one in found.curves if one.name == "given by m")
+    course_given = next(curve for curve in energies.curves if curve.name == "given by m")
     work = -(log["m"].tau[:-1] * np.diff(log["m"].q, axis=0)).sum()
-    assert given.energy_j[-1] == pytest.approx(work, rel=1e-9)
+    assert course_given.energy_j[-1] == pytest.approx(work, rel=1e-9)
     assert work > 0.05
 
 
 @pytest.mark.long
-def test_a_figure_shows_them_over_time() -> None:
+def test_a_figure_shows_energies_over_time() -> None:
     drawn = figure(run("wave"), "observed_energy")
-    lines, known, stored, given = drawn.axes
+    lines, known, stored, given_curve = drawn.axes
     assert len(lines.lines) == len(known.lines) == len(stored.lines) == 2
-    assert len(given.lines) == 4
+    assert len(given_curve.lines) == 4
 
 
 @pytest.mark.long
-def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() -> None:
-    """Sites that start apart; the reserve of a scenario that names none covers that."""
+def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
+    """Sites that start apart; the reserve of a scenario that names none covers such a jolt."""
     changes = {
         "control.law": "tdpa",
         "scheme": "digital",
@@ -172,38 +180,40 @@ def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() 
     changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
     covered = certify(simulate_scenario(load_scenario("two_sites", changes)))
     assert covered.observed.finding is ObservedFinding.PASSIVE
-    found = certify(
+    certificate = certify(
         simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
     )
-    assert found.observed.finding is ObservedFinding.NEGATIVE
-    assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(found)
-    known = next(one for one in found.observed.least if one.name == "known at s of m")
+    assert certificate.observed.finding is ObservedFinding.NEGATIVE
+    assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(certificate)
+    known = next(
+        energy for energy in certificate.observed.least if energy.name == "known at s of m"
+    )
     assert known.amount_j < -1e-7
-    assert found.observed.text in found.reasons
+    assert certificate.observed.text in certificate.reasons
 
 
 @pytest.mark.long
-def test_the_leaders_velocity_makes_energy_at_a_slower_follower() -> None:
-    """As it is published: the follower's damper acts on a velocity at which it is not moved."""
+def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
+    """As published: the follower's damper uses a velocity with which the follower is not moved."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
-    found = observe_energies(log)
-    taken = next(one for one in found.least if one.name == "taken by s")
-    assert found.finding is ObservedFinding.NEGATIVE
+    energies = observe_energies(log)
+    taken = next(energy for energy in energies.least if energy.name == "taken by s")
+    assert energies.finding is ObservedFinding.NEGATIVE
     assert taken.amount_j < -1e-3
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
-def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
+def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
     log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
-    found = observe_energies(log)
-    assert found.finding is ObservedFinding.PASSIVE
-    assert next(one for one in found.premises if one.name == "torque").text.startswith(
-        "cut off at m"
-    )
+    energies = observe_energies(log)
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert next(
+        premise for premise in energies.premises if premise.name == "torque"
+    ).text.startswith("cut off at m")
     assert np.abs(log["m"].tau).max() == 1.5
 
 
@@ -216,7 +226,7 @@ def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
         pytest.param(JITTER, id="jitter"),
     ],
 )
-def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
+def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
     shares = {
         "m1": {"m2": 0.1, "s": 0.9},
         "m2": {"m1": 0.4, "s": 0.6},
@@ -227,13 +237,13 @@ def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str,
     for name, beta in (("m2", 0.5), ("s", 1.5)):
         sites[name]["control"] = {**control, "beta": beta}
     scenario = unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
-    found = observe_energies(simulate_scenario(scenario))
-    assert found.finding is ObservedFinding.PASSIVE
-    assert all(premise.holds for premise in found.premises)
+    energies = observe_energies(simulate_scenario(scenario))
+    assert energies.finding is ObservedFinding.PASSIVE
+    assert all(premise.holds for premise in energies.premises)
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 4])
-def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
+def test_missing_law_memory_in_records_is_reported(mem: list[float]) -> None:
     data = recorded(
         "two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"}
     )
@@ -245,7 +255,7 @@ def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
         observe_energies(opened(broken))
 
 
-def test_three_places_explain_a_negative_energy_in_the_same_words() -> None:
+def test_three_texts_explain_negative_energy_alike() -> None:
     """The certificate, `compare --tune` and the page of the laws."""
     page = find_page("laws-tdpa.md").read_text(encoding="utf-8")
     assert NEGATIVE_ENERGY_MEANING in " ".join(page.split())

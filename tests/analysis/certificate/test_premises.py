@@ -1,6 +1,7 @@
-"""Each premise, where it holds and where it does not.
+"""Each premise, in runs that satisfy it and in runs that violate it.
 
-Walls that are held over a tick: what they give, the damping that takes it, and the premise by its name.
+Walls that are held over a tick: their energy, the damping that dissipates this energy, and the
+premise by its name.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,15 +33,15 @@ LATE = {"links.m1->s.outages_s": [[0.0, 0.5]], "links.m1->s.delay_ms": 100.0}
 
 
 def premises(name: str = "free", **overrides: object) -> dict[str, Premise]:
-    made = {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}}
-    return {p.name: p for p in runs.run(name, made).certificate.premises}
+    changes = {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}}
+    return {p.name: p for p in runs.run(name, changes).certificate.premises}
 
 
-def test_all_hold_in_free_motion() -> None:
-    found = premises()
-    assert [p.name for p in found.values() if p.holds is not True] == []
-    assert found["delays"].text == "constant on every link: 100 ms"
-    assert found["hands"].text == "nobody pushes"
+def test_free_motion_satisfies_all_premises() -> None:
+    checked = premises()
+    assert [p.name for p in checked.values() if p.holds is not True] == []
+    assert checked["delays"].text == "constant on every link: 100 ms"
+    assert checked["hands"].text == "nobody pushes"
 
 
 @pytest.mark.parametrize(
@@ -87,11 +88,13 @@ def test_all_hold_in_free_motion() -> None:
         ("torque", {"limits__tau_limit_nm": 10.0}, "cut off: m1 at "),
     ],
 )
-def test_one_that_fails_says_why(name: str, overrides: dict[str, object], says: str) -> None:
-    found = premises(**overrides)[name]
-    assert found.holds is False
-    assert says in found.text
-    assert [text for text in strings_in(found.quantities) if " " in text] == []
+def test_a_failed_premise_gives_its_reason(
+    name: str, overrides: dict[str, object], says: str
+) -> None:
+    failed = premises(**overrides)[name]
+    assert failed.holds is False
+    assert says in failed.text
+    assert [text for text in strings_in(failed.quantities) if " " in text] == []
 
 
 def strings_in(value: object) -> Iterator[str]:
@@ -109,10 +112,10 @@ def test_each_kind_of_quantities_has_its_sentence() -> None:
     assert set(premise_text.DESCRIBERS) == set(get_args(PremiseQuantities))
 
 
-def test_unequal_scalars_of_kd_hold() -> None:
-    found = premises(sites__m2__control__Kd=6.0)["Kd"]
-    assert found.holds
-    assert found.text == "one Kd up to a scalar: m1 1, m2 2, s 1"
+def test_unequal_scalars_of_kd_pass() -> None:
+    checked = premises(sites__m2__control__Kd=6.0)["Kd"]
+    assert checked.holds
+    assert checked.text == "one Kd up to a scalar: m1 1, m2 2, s 1"
 
 
 def test_a_hand_that_holds_on_fails_a_premise() -> None:
@@ -125,7 +128,7 @@ def test_a_hand_that_holds_on_fails_a_premise() -> None:
     assert "0.5 s of free motion at the end are less than 1 s" in briefly.text
 
 
-def test_a_damper_of_qd_may_give_energy_to_r() -> None:
+def test_a_damper_of_qd_may_feed_r() -> None:
     hands = next(p for p in runs.run("wall").certificate.premises if p.name == "hands")
     assert hands.holds is False
     assert hands.text.startswith("the hands and walls supplied up to")
@@ -135,16 +138,16 @@ def test_a_damper_of_qd_may_give_energy_to_r() -> None:
     ("apart_rad", "says"),
     [(0.5, "the walls supplied up to"), (1e-8, "the walls only absorbed energy")],
 )
-def test_what_rounding_gives_is_not_given(apart_rad: float, says: str) -> None:
-    """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, of a V of known arms that is hardly more."""
+def test_rounding_counts_as_no_energy(apart_rad: float, says: str) -> None:
+    """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, hardly less than V of known arms."""
     known = {"control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "control__Gamma": 0.0}
     starts = {f"sites__{name}__q0_rad": [0.3, 0.4] for name in ("m2", "s")}
     damper = {"sites__m1__environment": [{"kind": "viscous", "damping_nm_s_rad": [3.0, 3.0]}]}
-    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)[
+    checked = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)[
         "hands"
     ]
-    assert found.text.startswith(says)
-    assert found.holds is (apart_rad < 1e-3)
+    assert checked.text.startswith(says)
+    assert checked.holds is (apart_rad < 1e-3)
 
 
 SITE = "sites.s.environment"
@@ -158,24 +161,31 @@ def run(**changes: object) -> Log:
 
 
 def premise(log: Log) -> Premise | None:
-    return next((one for one in check_premises(gather_facts(log)) if one.name == "walls"), None)
+    return next(
+        (
+            premise_checked
+            for premise_checked in check_premises(gather_facts(log))
+            if premise_checked.name == "walls"
+        ),
+        None,
+    )
 
 
 def damper(b: float, **more: object) -> list[dict[str, object]]:
-    """The wall of `windup`, and a damper of the arm."""
+    """Returns the wall of `windup` with a damper of the arm."""
     wall = load_scenario("windup").sites["s"].environment[0]
-    place = {
+    damper_keys = {
         "point_m": list(wall.point_m),
         "normal": list(wall.normal),
         "stiffness_n_m": wall.stiffness_n_m,
     }
     return [
-        {"kind": "wall", "sampled": True, **place},
+        {"kind": "wall", "sampled": True, **damper_keys},
         {"kind": "viscous", "damping_nm_s_rad": b, **more},
     ]
 
 
-def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
+def test_sampled_walls_give_half_k_dx_squared() -> None:
     log = run()
     wall, s = log.scenario.sites["s"].environment[0], log["s"]
     x = np.cos(s.q[:, 0]) + np.cos(s.q.sum(axis=1))
@@ -189,44 +199,45 @@ def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
     # the spring is there, and nobody pressed it
     enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)
     gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
-    found = find_wall_energies(log)[0]
-    assert found.site == "s"
-    assert found.generated_j == pytest.approx(gives, rel=0.02)
-    assert found.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
-    assert found.arm_damping_n_s_m == 0.0
+    wall_energy = find_wall_energies(log)[0]
+    assert wall_energy.site == "s"
+    assert wall_energy.generated_j == pytest.approx(gives, rel=0.02)
+    assert wall_energy.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
+    assert wall_energy.arm_damping_n_s_m == 0.0
 
 
-def test_it_fails_the_premise_by_name() -> None:
-    found = premise(run())
-    assert found is not None
-    assert (found.name, found.holds) == ("walls", False)
+def test_the_sampled_wall_fails_its_premise_by_name() -> None:
+    wall = premise(run())
+    assert wall is not None
+    assert (wall.name, wall.holds) == ("walls", False)
 
 
 @pytest.mark.parametrize(("b", "holds"), [(1.0, False), (40.0, True)])
-def test_a_damper_of_the_arm_takes_what_the_wall_gives(b: float, *, holds: bool) -> None:
-    found = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
-    assert found is not None
-    assert found.holds is holds
+def test_a_damper_of_the_arm_dissipates_wall_energy(b: float, *, holds: bool) -> None:
+    wall = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
+    assert wall is not None
+    assert wall.holds is holds
 
 
-def test_a_damper_that_is_sampled_or_gone_takes_nothing() -> None:
+def test_sampled_or_missing_dampers_dissipate_nothing() -> None:
     for more in ({"sampled": True}, {"end_s": 1.0}):
-        found = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
-        assert found is not None
-        assert found.holds is False
+        wall = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
+        assert wall is not None
+        assert wall.holds is False
 
 
-def test_a_wall_out_of_reach_or_not_sampled_gives_nothing() -> None:
-    away = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
-    assert away is not None
-    assert away.holds
+def test_unreachable_or_continuous_walls_give_no_energy() -> None:
+    far_wall = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
+    assert far_wall is not None
+    assert far_wall.holds
     assert premise(run(**{f"{SITE}.0.sampled": False})) is None
 
 
 def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = False) -> float:
-    """The least damping b, N s/m, that takes what a held wall gives to a motion, h = 1; v at ends of parts.
+    """Returns the least damping b, N s/m, that dissipates the energy of a held wall over a
+    motion, h = 1; v at ends of parts.
 
-    Its speed is straight over each part; it begins and ends at rest in the wall.
+    The speed is linear over each part; the motion begins and ends at rest in the wall.
     """
     parts = v.reshape(ticks, -1)
     after = np.append(parts[1:, :1], [[0.0]], axis=0)
@@ -241,7 +252,10 @@ def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = 
 
 
 def test_damping_by_the_sampled_speed_gives_energy() -> None:
-    """Ticks of 1 s, K 2, B 1: K h / 2 + B is 2. Faster motions than half the tick rate are without bound."""
+    """Ticks of 1 s, K 2, B 1: K h / 2 + B is 2.
+
+    For motions faster than half the tick rate there is no bound.
+    """
     ticks, rng = 200, np.random.default_rng(5)
     t = np.arange(ticks * 400) / 400.0
     square = np.where(t % 2.0 < 1.0, 1.0, -1.0)  # its speed changes sides at each tick
@@ -264,20 +278,20 @@ def test_damping_by_the_sampled_speed_gives_energy() -> None:
 
 
 class PartOfSite(SimpleNamespace):
-    """As much of a site's log as presence depends on."""
+    """The parts of a site's log on which presence depends."""
 
     def __len__(self) -> int:
         return len(self.t_s)
 
 
 class LogOfSites(SimpleNamespace):
-    """As much of a log as presence depends on."""
+    """The parts of a log on which presence depends."""
 
     def __getitem__(self, site: str) -> PartOfSite:
         return self.parts[site]
 
 
-def test_absence_of_one_site_does_not_hide_that_another_left() -> None:
+def test_two_overlapping_absences_are_both_found() -> None:
     """Site a was away from 1 s to 2 s; site b left at 3 s of 5 s."""
     log = LogOfSites(
         sites=("a", "b"),

@@ -1,4 +1,4 @@
-"""V of a running session is that of `certify`, however the records come in."""
+"""V of a running session equals that of `certify`, in whatever blocks the records arrive."""
 
 import numpy as np
 import pytest
@@ -17,10 +17,12 @@ BLOCK = 60
 def courses(
     log: Log, *, late: int = 0, without: frozenset[int] = frozenset()
 ) -> list[EnergyCourse]:
-    """V of a log whose records come block by block, at its last site later; that lacks some."""
+    """Returns V of a log whose records arrive block by block, those of its last site later;
+    some are missing.
+    """
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
-    found = []
+    courses_found = []
     blocks = max(len(log[site]) for site in log.sites) // BLOCK + late + 1
     for n in range(blocks):
         for site in log.sites:
@@ -32,9 +34,9 @@ def courses(
         if (
             course := running.compute_next({site: windows[site].newest for site in log.sites})
         ) is not None:
-            found.append(course)
+            courses_found.append(course)
     assert running.reason == ""
-    return found
+    return courses_found
 
 
 def joined(found: list[EnergyCourse]) -> EnergyCourse:
@@ -42,7 +44,7 @@ def joined(found: list[EnergyCourse]) -> EnergyCourse:
 
 
 @pytest.mark.parametrize("late", [0, 7])
-def test_v_and_work_while_running_are_those_of_the_log(late: int) -> None:
+def test_v_while_running_equals_that_of_log(late: int) -> None:
     """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
     whole = runs.run("rich").balance
     course = joined(courses(runs.run("rich").log, late=late))
@@ -53,8 +55,8 @@ def test_v_and_work_while_running_are_those_of_the_log(late: int) -> None:
     assert np.abs(course.supplied - whole.external_work[rows]).max() < 1e-10 * most
 
 
-def test_v_without_some_records_is_that_of_an_incomplete_log() -> None:
-    """Records that cannot be had are passed over as `certify` passes over them."""
+def test_v_without_some_records_is_the_incomplete_logs() -> None:
+    """Unavailable records are passed over as `certify` passes over them."""
     log = runs.run("rich").log
     gap = frozenset(range(700, 760))
     whole = runs.run("rich").balance
@@ -69,20 +71,20 @@ def test_v_without_some_records_is_that_of_an_incomplete_log() -> None:
 def test_v_begins_late_in_a_session_joined_late() -> None:
     log, whole = runs.run("rich").log, runs.run("rich").balance
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
-    running, found = RunningEnergy(log.scenario, windows), []
+    running, blocks = RunningEnergy(log.scenario, windows), []
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
             for record in log[site].states[first : first + BLOCK]:
                 windows[site].receive(record)
-        found.append(running.compute_next({site: windows[site].newest for site in log.sites}))
-    assert found[0] is None
-    course = joined([one for one in found if one is not None])
+        blocks.append(running.compute_next({site: windows[site].newest for site in log.sites}))
+    assert blocks[0] is None
+    course = joined([block for block in blocks if block is not None])
     assert 2.4 < course.t_s[0] < 3.2
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * np.abs(whole.V).max()
 
 
-def test_a_law_without_such_a_v_says_so() -> None:
+def test_a_law_without_v_is_reported() -> None:
     log = runs.run("jitter", {"duration_s": 0.3}).log
     windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)

@@ -26,17 +26,17 @@ GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_every_released_version_is_certified(path: Path) -> None:
-    found = certify(trilat_net.open_log(path))
-    assert found.balance is not None
-    assert found.verdict.finding in (StabilityFinding.COVERED, StabilityFinding.ROSE)
-    assert np.abs(found.balance.unexplained).max() <= 1e-3 * found.balance.scale
+    certificate = certify(trilat_net.open_log(path))
+    assert certificate.balance is not None
+    assert certificate.verdict.finding in (StabilityFinding.COVERED, StabilityFinding.ROSE)
+    assert np.abs(certificate.balance.unexplained).max() <= 1e-3 * certificate.balance.scale
 
 
 @pytest.mark.parametrize(
     ("d", "motion", "passed"),
     [(0.2, EndBehaviour.DIVERGED, False), (3.0, EndBehaviour.DECAYS, True)],
 )
-def test_a_law_without_a_functional_is_judged_by_growth_alone(
+def test_growth_alone_judges_laws_without_functional(
     d: float, motion: EndBehaviour, passed: bool
 ) -> None:
     law = {
@@ -46,15 +46,17 @@ def test_a_law_without_a_functional_is_judged_by_growth_alone(
         "duration_s": 20.0,
         "rate_hz": 100,
     }
-    found = certify(trilat_net.simulate(load_scenario("free", law)))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d has no functional V"
-    assert found.end.behaviour is motion
-    assert found.passed is passed
+    certificate = certify(trilat_net.simulate(load_scenario("free", law)))
+    assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert (
+        certificate.verdict.text == "V cannot be judged: m1, m2, s: law p_d has no functional V"
+    )
+    assert certificate.end.behaviour is motion
+    assert certificate.passed is passed
 
 
 def outside(log: Log, *, known: bool) -> Log:
-    """The same records, of a slave that is outside of the program."""
+    """Returns the same records, of a slave with an external arm."""
     spec = log.scenario.sites["s"]
     arm = msgspec.structs.replace(spec.arm, known=known)
     sites = {
@@ -71,125 +73,129 @@ def still_free() -> Log:
     )
 
 
-def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
-    found = certify(outside(still_free(), known=False))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+def test_an_arm_with_unknown_theta_has_no_v() -> None:
+    certificate = certify(outside(still_free(), known=False))
+    assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
-        found.verdict.text
+        certificate.verdict.text
         == "V cannot be judged: s: theta of the arm is unknown, and V depends on it"
     )
 
 
-def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
+def test_external_arms_are_judged_with_identified_theta() -> None:
     as_told = certify(outside(still_free(), known=True))
     assert as_told.verdict.finding is StabilityFinding.COVERED
     assert "no record says who pushes the arm of s" in as_told.verdict.text
     change = lambda s: logs.replaced(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
-    found = certify(outside(logs.rewritten(still_free(), change=change), known=True))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert "the external arm of s does not move as its theta says" in found.verdict.text
+    certificate = certify(outside(logs.rewritten(still_free(), change=change), known=True))
+    assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert "the external arm of s does not move as its theta says" in certificate.verdict.text
 
 
-def test_records_with_none_beside_them_are_no_period() -> None:
-    found = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
-    assert found.verdict.text == f"V cannot be judged: {NO_PERIOD}"
+def test_a_record_without_neighbours_is_no_period() -> None:
+    certificate = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
+    assert certificate.verdict.text == f"V cannot be judged: {NO_PERIOD}"
 
 
-def test_a_period_too_long_for_the_gains_is_not_judged() -> None:
-    """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3."""
+def test_a_period_too_long_is_not_judged() -> None:
+    """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3 ms."""
     light = {
         "arm.m2_kg": 0.001,
         "rate_hz": 333,
         "duration_s": 2.0,
         "limits.qd_limit_rad_s": 100.0,
     }
-    found = certify(trilat_net.simulate(load_scenario("two_sites", light)))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert "the period is too long for these gains" in found.verdict.text
+    certificate = certify(trilat_net.simulate(load_scenario("two_sites", light)))
+    assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert "the period is too long for these gains" in certificate.verdict.text
 
 
-def test_gaps_are_left_out_and_told_of() -> None:
+def test_gaps_are_left_out_and_reported() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
     log = logs.rewritten(
         whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240)
     )
-    found = certify(log)
-    assert found.balance is not None
-    assert found.verdict.finding is StabilityFinding.COVERED
-    assert found.verdict.text.startswith(
+    certificate = certify(log)
+    assert certificate.balance is not None
+    assert certificate.verdict.finding is StabilityFinding.COVERED
+    assert certificate.verdict.text.startswith(
         "covered by the theorem, as far as the log tells: V did not rise: "
     )
-    assert "not judged: 0.995 to 1.35 s" in found.verdict.text
-    given = sum(np.abs(x).max() for x in found.balance.work.values())
-    assert given <= 1e-6  # nobody is said to have given what changed in the gap
-    assert runs.relative(found.balance) <= 1e-3
+    assert "not judged: 0.995 to 1.35 s" in certificate.verdict.text
+    work = sum(np.abs(x).max() for x in certificate.balance.work.values())
+    assert work <= 1e-6  # nobody is said to have given what changed in the gap
+    assert runs.relative(certificate.balance) <= 1e-3
     # s looks back by 150 ms
-    assert find_unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]
+    assert find_unjudged_spans(certificate.balance) == [pytest.approx((0.995, 1.35))]
 
 
-def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
-    """Whatever was lost, nobody is accused for what lies in the gap."""
+def test_a_gap_does_not_break_the_balance() -> None:
+    """Events within a gap are nobody's fault."""
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 100}).log
     for site in whole.sites:
-        found = certify(
+        certificate = certify(
             logs.rewritten(
                 whole, lambda s, site=site: not (s.site == site and 25 <= s.tick < 225)
             )
         )
-        assert found.verdict.finding is not StabilityFinding.BROKEN
+        assert certificate.verdict.finding is not StabilityFinding.BROKEN
 
 
-def test_an_unfinished_log_is_judged_as_far_as_it_goes() -> None:
+def test_an_unfinished_log_is_judged_to_its_end() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log
-    found = certify(logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False))
-    assert found.balance is not None
-    assert found.verdict.finding is StabilityFinding.COVERED
+    certificate = certify(
+        logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False)
+    )
+    assert certificate.balance is not None
+    assert certificate.verdict.finding is StabilityFinding.COVERED
     # what is under way then was sent since the first record
-    assert found.balance.t_s[0] == pytest.approx(1.205)
-    assert runs.relative(found.balance) <= 1e-3
+    assert certificate.balance.t_s[0] == pytest.approx(1.205)
+    assert runs.relative(certificate.balance) <= 1e-3
 
 
 @pytest.mark.parametrize("ticks", [0, 1])
-def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
-    found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
-    assert found.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
-    assert found.end.behaviour is EndBehaviour.UNDECIDED
-    assert not found.passed
+def test_nearly_empty_logs_are_reported(ticks: int) -> None:
+    certificate = certify(
+        logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks)
+    )
+    assert certificate.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
+    assert certificate.end.behaviour is EndBehaviour.UNDECIDED
+    assert not certificate.passed
 
 
 def test_two_records_are_a_period() -> None:
-    found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < 2))
-    assert found.balance is not None
-    assert len(found.balance.t_s) == 2
+    certificate = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < 2))
+    assert certificate.balance is not None
+    assert len(certificate.balance.t_s) == 2
 
 
-def test_nobody_moves_and_there_is_no_energy() -> None:
-    """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by it."""
+def test_arms_at_rest_have_no_energy() -> None:
+    """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by V(0)."""
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 1.0, "rate_hz": 200}
-    found = runs.run("paper", rest).certificate
-    assert found.balance is not None
-    assert found.balance.V[0] == 0.0
-    assert runs.relative(found.balance) <= 1e-3
-    assert found.verdict.finding is StabilityFinding.COVERED
+    certificate = runs.run("paper", rest).certificate
+    assert certificate.balance is not None
+    assert certificate.balance.V[0] == 0.0
+    assert runs.relative(certificate.balance) <= 1e-3
+    assert certificate.verdict.finding is StabilityFinding.COVERED
 
 
 def test_sites_of_different_rates_are_booked_together() -> None:
     rates = {"sites.m2.rate_hz": 250, "sites.s.rate_hz": 350, "rate_hz": 500, "duration_s": 4.0}
-    found = runs.run("asymmetric", rates).certificate
-    assert found.balance is not None
-    assert len(found.balance.t_s) == pytest.approx(2000, abs=5)
-    assert runs.relative(found.balance) <= 2e-4
-    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE)
+    certificate = runs.run("asymmetric", rates).certificate
+    assert certificate.balance is not None
+    assert len(certificate.balance.t_s) == pytest.approx(2000, abs=5)
+    assert runs.relative(certificate.balance) <= 2e-4
+    assert certificate.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE)
 
 
-def test_a_command_is_a_change_like_a_scripted_one() -> None:
-    found = certify(logs.busy().log)
-    assert found.balance is not None
-    assert runs.relative(found.balance) <= 5e-3
-    assert found.verdict.finding is not StabilityFinding.BROKEN
+def test_a_command_is_booked_like_scripted_changes() -> None:
+    certificate = certify(logs.busy().log)
+    assert certificate.balance is not None
+    assert runs.relative(certificate.balance) <= 5e-3
+    assert certificate.verdict.finding is not StabilityFinding.BROKEN
 
 
-def test_a_change_that_is_none_is_the_files_fault() -> None:
+def test_an_unreadable_change_is_a_log_error() -> None:
     change = lambda s: logs.replaced(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
     with pytest.raises(LogError, match="a command that cannot be read"):
         certify(logs.rewritten(logs.simulated("paper"), change=change))

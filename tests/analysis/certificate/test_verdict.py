@@ -1,6 +1,7 @@
-"""The verdict: covered, outside and yet not risen, risen and by whom, and logs that do not add up.
+"""The verdict: covered, outside the theorem without a rise, a rise with its cause, and logs
+whose balance is broken.
 
-What a certificate rests on: records that are missing, changed, or no site's own.
+The evidence of a certificate: records that are missing, changed, or from no site.
 """
 
 from collections.abc import Callable
@@ -31,109 +32,111 @@ from . import runs
 SHORT = {"duration_s": 4.0, "rate_hz": 200}
 
 
-def made(**overrides: object) -> Log:
+def simulate_free(**overrides: object) -> Log:
     dotted = {key.replace("__", "."): value for key, value in overrides.items()}
     return runs.run("free", {**SHORT, **dotted}).log
 
 
 def test_free_motion_is_covered() -> None:
-    found = certify(made())
-    assert found.verdict.finding is StabilityFinding.COVERED
-    assert found.verdict.text.startswith(
+    free_certificate = certify(simulate_free())
+    assert free_certificate.verdict.finding is StabilityFinding.COVERED
+    assert free_certificate.verdict.text.startswith(
         "covered by the theorem: V did not rise: 29.78 J at 0 s, 12"
     )
-    assert found.bounded_by_v
-    assert found.stability is Stability.OPEN
-    assert not found.passed
+    assert free_certificate.bounded_by_v
+    assert free_certificate.stability is Stability.OPEN
+    assert not free_certificate.passed
 
 
-def test_hands_are_told_of_and_excused() -> None:
-    found = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
-    assert found.verdict.finding is StabilityFinding.COVERED
+def test_hands_are_named_and_excused() -> None:
+    certificate = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
+    assert certificate.verdict.finding is StabilityFinding.COVERED
     assert (
         "covered by the theorem: V rose by no more than the hands gave: 24 J"
-        in found.verdict.text
+        in certificate.verdict.text
     )
 
 
-def test_outside_and_yet_not_risen() -> None:
-    found = runs.run("wall").certificate
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.verdict.text.startswith(
+def test_outside_the_theorem_without_a_rise() -> None:
+    certificate = runs.run("wall").certificate
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert certificate.verdict.text.startswith(
         "the theorem does not apply (premises that fail: hands); V rose by no more than the"
     )
-    assert found.bounded_by_v
+    assert certificate.bounded_by_v
 
 
-def test_a_rise_is_named_with_time_amount_and_giver() -> None:
-    found = runs.run("free", runs.JITTER).certificate
-    rise = found.verdict.rise
-    assert found.verdict.finding is StabilityFinding.ROSE
+def test_a_rise_names_time_amount_and_cause() -> None:
+    certificate = runs.run("free", runs.JITTER).certificate
+    rise = certificate.verdict.rise
+    assert certificate.verdict.finding is StabilityFinding.ROSE
     assert rise is not None
-    assert rise.amount > 10 * found.verdict.tolerance
+    assert rise.amount > 10 * certificate.verdict.tolerance
     assert sum(rise.causes.values()) >= rise.amount
     assert all("->" in cause for cause in rise.causes)
-    share = 100.0 * rise.amount / found.balance.V.max()
+    share = 100.0 * rise.amount / certificate.balance.V.max()
     assert (
         f"V rose by {rise.amount:.3g} J ({share:.3g} % of its largest value) "
-        in found.verdict.text
+        in certificate.verdict.text
     )
-    assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
+    assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in certificate.verdict.text
 
 
 def test_kd_of_different_shape_makes_v_rise() -> None:
-    found = certify(
-        made(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
+    certificate = certify(
+        simulate_free(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
     )
-    assert found.verdict.finding is StabilityFinding.ROSE
-    assert found.verdict.rise is not None
-    assert list(found.verdict.rise.causes) == ["what beta does not cancel"]
+    assert certificate.verdict.finding is StabilityFinding.ROSE
+    assert certificate.verdict.rise is not None
+    assert list(certificate.verdict.rise.causes) == ["what beta does not cancel"]
 
 
-def test_a_slow_digital_loop_is_fed_by_sampling() -> None:
-    """T = 0 at 80 Hz: `digital` keeps swinging, and it is the hold that keeps it up."""
-    found = certify(made(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0))
-    assert found.verdict.finding is StabilityFinding.ROSE
-    assert found.verdict.rise is not None
-    assert next(iter(found.verdict.rise.causes)) == "sampling"
-    assert found.end.behaviour is not EndBehaviour.CONVERGED
+def test_sampling_feeds_a_slow_digital_loop() -> None:
+    """T = 0 at 80 Hz: `digital` keeps swinging, because torques are held over a tick."""
+    certificate = certify(
+        simulate_free(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0)
+    )
+    assert certificate.verdict.finding is StabilityFinding.ROSE
+    assert certificate.verdict.rise is not None
+    assert next(iter(certificate.verdict.rise.causes)) == "sampling"
+    assert certificate.end.behaviour is not EndBehaviour.CONVERGED
 
 
 def tampered(change: Callable[[State], State]) -> Certificate:
-    return certify(logs.rewritten(made(rate_hz=500, duration_s=2.0), change=change))
+    return certify(logs.rewritten(simulate_free(rate_hz=500, duration_s=2.0), change=change))
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
-def test_record_that_was_changed_breaks_balance_of_its_site(field: str) -> None:
+def test_a_changed_record_breaks_its_sites_balance(field: str) -> None:
     def change(state: State) -> State:
         late = state.site == "m2" and state.tick >= 375
         values = [1.05 * x for x in getattr(state, field)]
         return msgspec.structs.replace(state, **{field: values}) if late else state
 
-    found = tampered(change)
-    assert found.verdict.finding is StabilityFinding.BROKEN
-    assert not found.passed
-    assert "were not made by the equations that the log claims" in found.verdict.text
+    certificate = tampered(change)
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
+    assert not certificate.passed
+    assert "were not made by the equations that the log claims" in certificate.verdict.text
 
 
-def test_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
+def test_changed_records_break_balances_under_varying_delay() -> None:
     log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
-    found = certify(
+    certificate = certify(
         logs.rewritten(
             log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s
         )
     )
-    assert found.verdict.finding is StabilityFinding.BROKEN
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
 
 
-def test_hands_that_were_erased_break_the_balance() -> None:
+def test_erased_hands_break_the_balance() -> None:
     log = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
-    found = certify(
+    certificate = certify(
         logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
     )
-    assert found.verdict.finding is StabilityFinding.BROKEN
-    assert "the energy of m1 does not add up" in found.verdict.text
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
+    assert "the energy of m1 does not add up" in certificate.verdict.text
 
 
 FOUR = """
@@ -161,53 +164,58 @@ d = { c = 1.0 }
 
 
 def test_two_closed_groups_are_refused_and_named() -> None:
-    found = certify(trilat_net.simulate(parse_scenario(FOUR)))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert "{a, b} and {c, d} follow nobody outside: beta is not unique" in found.verdict.text
-    assert found.groups == (("a", "b"), ("c", "d"))
-    assert found.balance is None
+    certificate_found = certify(trilat_net.simulate(parse_scenario(FOUR)))
+    assert certificate_found.verdict.finding is StabilityFinding.NOT_JUDGED
+    assert (
+        "{a, b} and {c, d} follow nobody outside: beta is not unique"
+        in certificate_found.verdict.text
+    )
+    assert certificate_found.groups == (("a", "b"), ("c", "d"))
+    assert certificate_found.balance is None
 
 
-def test_groups_that_only_a_change_makes_are_refused_too() -> None:
+def test_groups_made_by_a_change_are_refused() -> None:
     joined = FOUR.replace("c = { d = 1.0 }", "c = { d = 0.5, a = 0.5 }")
     step = '[[timeline]]\nat_s = 1.0\ndominance = "c"\nto = { d = 1.0 }\nramp_s = 0.5\n'
     assert certify(trilat_net.simulate(parse_scenario(joined))).balance is not None
-    found = certify(trilat_net.simulate(parse_scenario(joined + step)))
-    assert found.verdict.finding is StabilityFinding.NOT_JUDGED
+    certificate = certify(trilat_net.simulate(parse_scenario(joined + step)))
+    assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
 
 
-def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
-    """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
-    found = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.end.stability is Stability.OPEN
-    assert found.bounded_by_v
+def test_a_site_without_weight_converges_after_peers() -> None:
+    """V does not contain m2; if only the shares fail, the motion of its peers bounds m2."""
+    certificate = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert certificate.end.stability is Stability.OPEN
+    assert certificate.bounded_by_v
 
 
-def test_site_without_weight_is_left_to_growth_where_more_fails() -> None:
+def test_weightless_sites_with_other_failures_need_growth() -> None:
     hand = {
         "sites.m2.hands": [
             {"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}
         ]
     }
-    found = runs.run("free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}).certificate
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert not found.bounded_by_v
-    assert not found.passed
+    certificate = runs.run(
+        "free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}
+    ).certificate
+    assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
+    assert not certificate.bounded_by_v
+    assert not certificate.passed
 
 
 def still() -> Certificate:
-    """The paper's law at rest: nothing leaves it open."""
+    """Returns a certificate of the paper's law at rest, which nothing leaves open."""
     return runs.run("free", {"duration_s": 30.0, "rate_hz": 100}).certificate
 
 
-def test_run_that_comes_to_rest_with_v_falling_is_stable() -> None:
+def test_rest_with_falling_v_is_stable() -> None:
     assert still().stability is Stability.STABLE
     assert still().passed
     assert still().reasons == ()
 
 
-def test_growth_fails_a_run_whatever_v_did() -> None:
+def test_growth_fails_a_run_despite_v() -> None:
     grown = replace(still(), end=still().end._replace(behaviour=EndBehaviour.GROWS))
     assert grown.stability is Stability.NOT_STABLE
     assert not grown.accepts(("bounded", "open"))
@@ -223,23 +231,23 @@ def test_growth_fails_a_run_whatever_v_did() -> None:
         (EndBehaviour.DRIFTS, ("bounded", "open"), False),
     ],
 )
-def test_only_what_is_accepted_passes_besides_a_stable_run(
+def test_only_accepted_outcomes_pass_besides_stable(
     behaviour: EndBehaviour, accepted: tuple[str, ...], passes: bool
 ) -> None:
-    found = replace(still(), end=still().end._replace(behaviour=behaviour))
-    assert not found.passed
-    assert found.accepts(accepted) is passes
+    certificate = replace(still(), end=still().end._replace(behaviour=behaviour))
+    assert not certificate.passed
+    assert certificate.accepts(accepted) is passes
 
 
 def test_a_broken_balance_is_never_accepted() -> None:
-    found = tampered(
+    certificate = tampered(
         lambda s: msgspec.structs.replace(s, q=[1.05 * x for x in s.q]) if s.tick > 375 else s
     )
-    assert found.verdict.finding is StabilityFinding.BROKEN
-    assert not found.accepts(("bounded", "open"))
+    assert certificate.verdict.finding is StabilityFinding.BROKEN
+    assert not certificate.accepts(("bounded", "open"))
 
 
-def test_an_unstable_rest_refutes_or_leaves_a_run_open() -> None:
+def test_an_unstable_rest_never_passes_a_run() -> None:
     roots = LoopRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
     refuted = replace(still(), roots=roots)
     assert refuted.stability is Stability.NOT_STABLE
@@ -270,12 +278,12 @@ def test_v_that_rises_at_the_end_is_named() -> None:
 RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 
 
-def found(data: bytes, **options: float) -> Certificate:
+def certify_bytes(data: bytes, **options: float) -> Certificate:
     return certify(opened(data), **options)
 
 
-def test_whole_log_is_stable_and_says_what_it_rests_on() -> None:
-    certificate = found(recorded("free", RUN))
+def test_a_whole_log_is_stable_with_reasons() -> None:
+    certificate = certify_bytes(recorded("free", RUN))
     assert certificate.stability is Stability.STABLE
     facts = certificate.to_dict()["evidence"]
     assert facts == {
@@ -289,18 +297,18 @@ def test_whole_log_is_stable_and_says_what_it_rests_on() -> None:
 
 
 @pytest.mark.parametrize("cut", [range(1490, 1525), range(2965, 3000), range(35)])
-def test_seven_tenths_of_a_second_less_leave_a_run_open(cut: range) -> None:
-    """At its end, its beginning or in between, of one site."""
+def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
+    """At the end, the beginning or in between, of one site."""
     taken = taken_apart(recorded("free", RUN)).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
-    own = "/trilat/free/s/state"
+    topic = "/trilat/free/s/state"
     taken.messages = [
-        m for m in taken.messages if topics[m.channel] != own or m.sequence not in cut
+        m for m in taken.messages if topics[m.channel] != topic or m.sequence not in cut
     ]
-    accounts[own] = accounts[own].replace(
+    accounts[topic] = accounts[topic].replace(
         "received 3000, missing 0", "received 2965, missing 35"
     )
-    certificate = found(taken.bytes())
+    certificate = certify_bytes(taken.bytes())
     assert certificate.stability is Stability.OPEN
     assert not certificate.passed
     assert any(
@@ -308,44 +316,44 @@ def test_seven_tenths_of_a_second_less_leave_a_run_open(cut: range) -> None:
     )
     assert not certificate.accepts(("bounded",))
     assert certificate.accepts(("open",))
-    assert found(taken.bytes(), min_coverage=0.9).passed
+    assert certify_bytes(taken.bytes(), min_coverage=0.9).passed
 
 
-def test_of_v_the_periods_count_that_rest_on_records() -> None:
+def test_only_recorded_periods_count_for_v() -> None:
     """Single records of one site: few are missing, and each leaves several periods of V unjudged."""
     data = edited(recorded("free", RUN), record=without("s", set(range(100, 3000, 1000))))
-    certificate = found(data)
+    certificate = certify_bytes(data)
     assert certificate.evidence.coverage.share == 0.999
     assert certificate.evidence.functional_share is not None
     assert certificate.evidence.functional_share < 0.999
     assert any(why.startswith("V is judged over 99.") for why in certificate.reasons)
 
 
-def test_a_changed_log_is_accepted_by_no_word() -> None:
-    taken = taken_apart(recorded("free", RUN))
-    taken.metadata("trilat.session")["seed"] += "0"
-    certificate = found(taken.bytes())
+def test_no_option_accepts_a_changed_log() -> None:
+    pieces = taken_apart(recorded("free", RUN))
+    pieces.metadata("trilat.session")["seed"] += "0"
+    certificate = certify_bytes(pieces.bytes())
     assert any("changed since it was made" in why for why in certificate.reasons)
     assert not certificate.accepts(("bounded", "open"))
 
 
 @pytest.mark.parametrize("law", ["adaptive", "adaptive_box"])
-def test_torques_that_the_law_did_not_give_break_the_balance(law: str) -> None:
+def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
     def scaled(r: dict) -> dict:
-        own = r["site"] == "m1" and r["tick"] >= 40
-        return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if own else r
+        is_own = r["site"] == "m1" and r["tick"] >= 40
+        return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if is_own else r
 
     data = recorded("free", {"duration_s": 2.0, "rate_hz": 100, "control.law": law})
-    assert found(data).verdict.finding is not StabilityFinding.BROKEN
+    assert certify_bytes(data).verdict.finding is not StabilityFinding.BROKEN
     for change in (scaled, lambda r: r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}):
-        certificate = found(edited(data, record=change))
+        certificate = certify_bytes(edited(data, record=change))
         assert certificate.verdict.finding is StabilityFinding.BROKEN
         assert "the torque of m1 is not that of Eq. (13)" in certificate.verdict.text
         assert not certificate.accepts(("open",))
 
 
-def test_sites_that_did_not_react_leave_a_run_open() -> None:
+def test_sites_that_did_not_react_stay_open() -> None:
     claims = {"driver": "rerun", "rerun_executed": "s"}
-    certificate = found(edited(recorded("free", RUN), session=claims))
+    certificate = certify_bytes(edited(recorded("free", RUN), session=claims))
     assert any("m1 and m2, as recorded, did not react" in why for why in certificate.reasons)
     assert certificate.stability is Stability.OPEN

@@ -1,4 +1,4 @@
-"""Ratios over frequency: decided where they are driven, undecided elsewhere, never the hand's own."""
+"""Ratios over frequency: decided at driven frequencies, undecided elsewhere, never the hand's own."""
 
 import math
 
@@ -32,33 +32,33 @@ def strongest(
     return estimate_responses(drive, x, y, usable, rate_hz, least)[0]
 
 
-def test_a_filter_is_found_again() -> None:
+def test_a_known_filter_is_identified() -> None:
     """Gain and phase of a known system, by SciPy's freqz."""
     b, a = signal.butter(1, 3.0, fs=RATE_HZ)
     x = noise(1)
-    found = strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
-    _, H = signal.freqz(b, a, worN=[found.frequency_hz], fs=RATE_HZ)
-    assert found.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * found.error))
-    assert found.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
-    assert found.coherence > 0.95
+    response = strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
+    _, H = signal.freqz(b, a, worN=[response.frequency_hz], fs=RATE_HZ)
+    assert response.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * response.error))
+    assert response.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
+    assert response.coherence > 0.95
 
 
-def test_what_does_not_belong_together_is_undecided() -> None:
+def test_unrelated_signals_are_undecided() -> None:
     x = noise(1)
-    found = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
-    assert found.gain is None
-    assert "the coherence" in found.why
+    response = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
+    assert response.gain is None
+    assert "the coherence" in response.why
 
 
 def test_one_push_is_not_enough() -> None:
     """A single event is coherent with anything."""
     x = np.where(np.abs(np.arange(len(EVERYTHING)) - 2000) < 100, 1.0, 0.0)
-    found = strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
-    assert found.gain is None
-    assert "stretches of 4 s" in found.why
+    response = strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
+    assert response.gain is None
+    assert "stretches of 4 s" in response.why
 
 
-def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
+def test_weak_drives_and_missing_records_are_named() -> None:
     x = noise(1)
     assert (
         strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why
@@ -69,11 +69,12 @@ def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
     assert "no stretch of 4 s" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
-def test_in_a_closed_loop_the_driver_decides_whose_impedance() -> None:
-    """A spring k held against a damper b that others shake: torque / speed is b + noise's, not -k/s.
+def test_closed_loop_impedance_depends_on_the_driver() -> None:
+    """A spring k held against a damper b that others shake: torque / speed is b + noise's, not
+    -k/s.
 
-    The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x the ratio is b;
-    the plain ratio of the two, without the drive, is far off.
+    The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x
+    the ratio is b; the plain ratio of the two, without the drive, is far off.
     """
     k, b, h = 5.0, 2.0, 1.0 / RATE_HZ
     x, torque, speed = noise(3), np.zeros(len(EVERYTHING)), np.zeros(len(EVERYTHING))
@@ -111,41 +112,47 @@ def shaken() -> dict[str, object]:
     }
 
 
-def test_the_impedance_of_a_linear_pair_is_its_closed_form() -> None:
+def test_linear_pair_has_its_closed_form_impedance() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
     log = simulated("two_sites", shaken())
-    (found,) = (
-        one
-        for one in compute_log_metrics(log).responses
-        if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+    (measured_response,) = (
+        response
+        for response in compute_log_metrics(log).responses
+        if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
-    assert found.ratio.frequency_hz == 1.0
+    assert measured_response.ratio.frequency_hz == 1.0
     s = 2j * math.pi
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
     M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
-    own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
+    own_impedance = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
     far = -20.0 * np.exp(-0.1 * s) * np.eye(2)
-    q = np.linalg.solve(np.block([[own, far], [far, own]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    q = np.linalg.solve(
+        np.block([[own_impedance, far], [far, own_impedance]]), np.array([1.0, 0.0, 0.0, 0.0])
+    )
     Z = 1.0 / (s * q[0])
-    assert found.ratio.gain == pytest.approx(abs(Z), rel=0.02)
-    assert found.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
+    assert measured_response.ratio.gain == pytest.approx(abs(Z), rel=0.02)
+    assert measured_response.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
 
 
-def test_a_hand_that_stands_still_tells_nothing_of_its_site() -> None:
+def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
-    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
-    for one in found:
-        if one.kind == "impedance":
-            assert one.ratio.gain is None
+    responses = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
+    for response in responses:
+        if response.kind == "impedance":
+            assert response.ratio.gain is None
 
 
 def closed_form_impedance(frequency_hz: float, c2: float) -> complex:
-    """Of joint 1 of a pair M s^2 + d s + K, coupled by K exp(-s T), gains as in `shaken`."""
+    """Returns the impedance of joint 1 of a pair M s^2 + d s + K, coupled by K exp(-s T), gains
+    as in `shaken`.
+    """
     s = 2j * math.pi * frequency_hz
     M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
-    own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
+    own_impedance = M * s**2 + np.eye(2) * (10.0 * s + 20.0)
     far = -20.0 * np.exp(-0.1 * s) * np.eye(2)
-    q = np.linalg.solve(np.block([[own, far], [far, own]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    q = np.linalg.solve(
+        np.block([[own_impedance, far], [far, own_impedance]]), np.array([1.0, 0.0, 0.0, 0.0])
+    )
     return complex(1.0 / (s * q[0]))
 
 
@@ -161,17 +168,19 @@ MULTISINE = {
 def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
     """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
     log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
-    found = next(
-        one for one in compute_log_metrics(log).responses if (one.at, one.joint) == ("m", 1)
+    measured_response = next(
+        response
+        for response in compute_log_metrics(log).responses
+        if (response.at, response.joint) == ("m", 1)
     )
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
-    assert len(found.spectrum) == lines
-    for line in found.spectrum:
+    assert len(measured_response.spectrum) == lines
+    for line in measured_response.spectrum:
         Z = closed_form_impedance(line.frequency_hz, c2)
         assert line.gain == pytest.approx(abs(Z), rel=0.02 + 2.0 * line.error)
         assert line.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.02 + 3.0 * line.error)
         assert line.coherence > (0.998 if hand is MULTISINE else 0.92)
-    assert found.ratio in found.spectrum
-    assert [line.frequency_hz for line in found.spectrum] == sorted(
-        line.frequency_hz for line in found.spectrum
+    assert measured_response.ratio in measured_response.spectrum
+    assert [line.frequency_hz for line in measured_response.spectrum] == sorted(
+        line.frequency_hz for line in measured_response.spectrum
     )

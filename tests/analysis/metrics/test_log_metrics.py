@@ -1,14 +1,7 @@
-"""Logs of every kind: what can be said is said, and what cannot has its reason.
+"""Logs of every kind: every metric has a number or a reason.
 
-Runs side by side.
-
-Effort and saturation in closed form.
-
-The stiffness that a hand feels at rest.
-
-Force sharing at rest: sum_i (pi_i / K_i) tau_i = 0.
-
-How near estimates came to the truth.
+Runs side by side. Effort and saturation in closed form. The stiffness that a hand feels at
+rest. Force sharing at rest: sum_i (pi_i / K_i) tau_i = 0. Errors of the estimates.
 """
 
 import csv
@@ -27,21 +20,21 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
 
-from .written import pair, simulated, under
+from .written import pair, replace_scenario, simulated
 
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 
 def told(log: Log) -> dict[str, Any]:
-    """The facts of a log, checked for what holds of all."""
+    """Returns the facts of a log after checking the rules that all facts obey."""
     measured = compute_log_metrics(log)
-    found: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
-    assert set(found["sites"]) == set(log.sites)
-    assert len(found["links"]) == len(log.sites) * (len(log.sites) - 1)
-    unknown = found["unknown"]
+    facts: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
+    assert set(facts["sites"]) == set(log.sites)
+    assert len(facts["links"]) == len(log.sites) * (len(log.sites) - 1)
+    unknown = facts["unknown"]
     for quantity in quantities():
         kind = "run" if quantity.of == "run" else f"{quantity.of}s"
-        places = {"run": found["run"]} if kind == "run" else found[kind]
+        places = {"run": facts["run"]} if kind == "run" else facts[kind]
         for name, values in places.items():
             path = f"run.{quantity.key}" if kind == "run" else f"{kind}.{name}.{quantity.key}"
             value = values[quantity.key]
@@ -50,65 +43,65 @@ def told(log: Log) -> dict[str, Any]:
             assert path not in unknown or unknown[path]
         whole = measured.run_value(quantity)
         assert (whole.value is None) == bool(whole.why)
-    return found
+    return facts
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_every_released_version_is_measured(path: Path) -> None:
-    found = told(trilat_net.open_log(path))
-    assert found["sites"]["s"]["rms_error_rad"] > 0.0
-    assert found["sites"]["s"]["unaccounted_j"] < 1e-3
-    assert found["links"]["m2->s"]["age_mean_ms"] > 0.0
+    facts = told(trilat_net.open_log(path))
+    assert facts["sites"]["s"]["rms_error_rad"] > 0.0
+    assert facts["sites"]["s"]["unaccounted_j"] < 1e-3
+    assert facts["links"]["m2->s"]["age_mean_ms"] > 0.0
 
 
 def test_busy_and_uneven_sites_are_measured() -> None:
-    found = told(logs.busy().log)
-    assert found["links"]["b->a"]["burst"] > 1.0
-    assert found["links"]["b->a"]["loss"] == pytest.approx(0.2, abs=0.1)
+    facts = told(logs.busy().log)
+    assert facts["links"]["b->a"]["burst"] > 1.0
+    assert facts["links"]["b->a"]["loss"] == pytest.approx(0.2, abs=0.1)
     told(logs.simulated("four"))
 
 
-def test_gap_and_late_begin_leave_numbers_and_are_counted() -> None:
+def test_gaps_and_late_starts_are_counted() -> None:
     log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
     torn = logs.rewritten(
         log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False
     )
-    found = told(torn)
-    assert found["sites"]["m1"]["missing"] == 40.0
-    assert found["sites"]["m1"]["unaccounted_j"] < 1e-3
-    assert not found["complete"]
+    facts = told(torn)
+    assert facts["sites"]["m1"]["missing"] == 40.0
+    assert facts["sites"]["m1"]["unaccounted_j"] < 1e-3
+    assert not facts["complete"]
     late = told(logs.rewritten(log, lambda state: 150 < state.tick < 400))
     assert late["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert late["run"]["spread_max_rad"] > 0.0
 
 
-def test_site_without_any_record_takes_only_its_own_figures_away() -> None:
+def test_a_missing_site_lacks_only_its_figures() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    found = told(logs.rewritten(log, lambda state: state.site != "m1"))
-    assert found["sites"]["m2"]["controller_j"] is not None
-    assert found["links"]["m2->s"]["delay_j"] is not None
-    assert found["unknown"]["sites.m1.controller_j"] == "no records of m1"
-    assert found["unknown"]["links.m1->s.following_rms_rad"] == "no records of m1"
-    assert found["unknown"]["run.spread_rms_rad"] == "no records of m1"
-    assert found["unknown"]["windows_at_rest"] == "no records of m1"
-    assert "m1" not in found["parameters"]
+    facts = told(logs.rewritten(log, lambda state: state.site != "m1"))
+    assert facts["sites"]["m2"]["controller_j"] is not None
+    assert facts["links"]["m2->s"]["delay_j"] is not None
+    assert facts["unknown"]["sites.m1.controller_j"] == "no records of m1"
+    assert facts["unknown"]["links.m1->s.following_rms_rad"] == "no records of m1"
+    assert facts["unknown"]["run.spread_rms_rad"] == "no records of m1"
+    assert facts["unknown"]["windows_at_rest"] == "no records of m1"
+    assert "m1" not in facts["parameters"]
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 3])
-def test_next_to_nothing_is_no_error(ticks: int) -> None:
+def test_nearly_empty_logs_are_no_error(ticks: int) -> None:
     log = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
-    found = told(logs.rewritten(log, lambda state: state.tick < ticks))
-    assert (found["sites"]["m"]["controller_j"] is None) == (ticks < 2)
-    assert (found["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
+    facts = told(logs.rewritten(log, lambda state: state.tick < ticks))
+    assert (facts["sites"]["m"]["controller_j"] is None) == (ticks < 2)
+    assert (facts["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
 
 
-def test_a_run_that_diverged_is_measured_up_to_there() -> None:
-    found = told(logs.diverged())
-    assert found["sites"]["m1"]["unaccounted_j"] < 1e-2
+def test_a_diverged_run_is_measured_until_divergence() -> None:
+    facts = told(logs.diverged())
+    assert facts["sites"]["m1"]["unaccounted_j"] < 1e-2
 
 
 @pytest.mark.parametrize("size", [1e200, 1e308])
-def test_numbers_beyond_all_physics_are_no_numbers_and_no_error(size: float) -> None:
+def test_unphysical_numbers_are_missing_without_error(size: float) -> None:
     log = simulated("contact", {"duration_s": 5.0, "rate_hz": 100})
     grown = logs.rewritten(
         log,
@@ -123,13 +116,13 @@ def test_numbers_beyond_all_physics_are_no_numbers_and_no_error(size: float) -> 
     assert told(grown)["sites"]["m"]["mechanical_j"] is None
 
 
-def test_loops_are_told_of_where_a_clock_was_read() -> None:
+def test_loops_are_reported_if_clocks_were_read() -> None:
     """Every loop late by its tick in us, every tick 7 us of work."""
     log = logs.timed(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))
-    found = told(log)["sites"]["m1"]
-    assert found["late_max_us"] == 199.0
-    assert found["busy_p99_us"] == 7.0
-    assert found["overruns"] == 0.0
+    facts = told(log)["sites"]["m1"]
+    assert facts["late_max_us"] == 199.0
+    assert facts["busy_p99_us"] == 7.0
+    assert facts["overruns"] == 0.0
     assert (
         told(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))["sites"]["m1"][
             "late_max_us"
@@ -145,7 +138,7 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
     assert sorted(keys) == sorted(quantity.key for quantity in quantities())
 
 
-def test_row_is_largest_of_places_or_their_sum() -> None:
+def test_a_row_is_the_largest_or_the_sum() -> None:
     log = pair(
         lambda site, _: {
             "tau": [3.0 if site == "m" else 4.0, 0.0],
@@ -153,15 +146,15 @@ def test_row_is_largest_of_places_or_their_sum() -> None:
             "q_des": [0.0, 0.0],
         }
     )
-    found = compare_metrics([log, log], ["a", "b"])
-    assert found.columns == ("a", "b")
-    assert found.row("peak_tau_nm").values == (4.0, 4.0)
-    assert found.row("effort_nm2_s").values == pytest.approx((25.0 * 4.0, 25.0 * 4.0))
-    assert found.row("max_error_rad").values == (0.1, 0.1)
+    comparison = compare_metrics([log, log], ["a", "b"])
+    assert comparison.columns == ("a", "b")
+    assert comparison.row("peak_tau_nm").values == (4.0, 4.0)
+    assert comparison.row("effort_nm2_s").values == pytest.approx((25.0 * 4.0, 25.0 * 4.0))
+    assert comparison.row("max_error_rad").values == (0.1, 0.1)
 
 
-def test_what_one_site_lacks_the_whole_run_lacks() -> None:
-    """A largest value of some sites is none of the run; a site that cannot have one takes nothing away."""
+def test_runs_lack_figures_missing_at_a_site() -> None:
+    """A largest value of some sites is none of the run; sites that cannot have the figure do not count."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     torn = rewritten(log, lambda state: state.site != "m2")
     row = compare_metrics([log, torn]).row("max_error_rad")
@@ -170,7 +163,7 @@ def test_what_one_site_lacks_the_whole_run_lacks() -> None:
     assert row.entries[1].why == "m2: no records of m2"
 
 
-def test_rows_that_no_run_could_have_are_left_out() -> None:
+def test_rows_without_any_value_are_left_out() -> None:
     free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     wall = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
     keys = [row.quantity.key for row in compare_metrics([free]).rows]
@@ -182,11 +175,11 @@ def test_rows_that_no_run_could_have_are_left_out() -> None:
         compare_metrics([free]).row("force_peak_n")
 
 
-def test_json_has_a_value_and_a_reason_per_column() -> None:
+def test_json_has_value_and_reason_per_column() -> None:
     free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    found = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
-    assert found["columns"] == ["log"]
-    for row in found["rows"]:
+    facts = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
+    assert facts["columns"] == ["log"]
+    for row in facts["rows"]:
         assert (row["values"][0] is None) == (row["unknown"][0] is not None)
 
 
@@ -194,15 +187,15 @@ def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
     """int (a^2 + b^2 sin^2) dt over whole periods is (a^2 + b^2 / 2) times the time."""
     a, b = 3.0, 8.0
     log = pair(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
-    found = compute_log_metrics(log).sites["m"]
-    assert found["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
-    assert found["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
-    assert found["peak_tau_nm"].value == pytest.approx(b, rel=1e-9)
-    assert found["saturated_share"].value == 0.0
+    figures = compute_log_metrics(log).sites["m"]
+    assert figures["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
+    assert figures["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
+    assert figures["peak_tau_nm"].value == pytest.approx(b, rel=1e-9)
+    assert figures["saturated_share"].value == 0.0
 
 
-def test_the_share_of_ticks_at_the_limit() -> None:
-    """200 N m is the limit of a scenario that names none; -200 is at it as well."""
+def test_saturation_is_the_share_of_limited_ticks() -> None:
+    """200 N m is the limit of a scenario that names none; -200 counts as well."""
     log = pair(lambda _, t_s: {"tau": [0.0, -200.0 if t_s < 1.0 else 199.9]})
     assert compute_log_metrics(log).sites["s"]["saturated_share"].value == pytest.approx(0.25)
 
@@ -228,73 +221,79 @@ ANCHORED = {
 }
 
 
-def test_learning_gravity_is_spring_that_ties_arms_to_pose() -> None:
+def test_learnt_gravity_is_a_spring_to_pose() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
-    found = compute_log_metrics(simulated("paper", ANCHORED))
-    assert [one.site for one in found.stiffness] == ["m1", "m1"]
-    second = found.stiffness[1]
+    metrics = compute_log_metrics(simulated("paper", ANCHORED))
+    assert [stiffness.site for stiffness in metrics.stiffness] == ["m1", "m1"]
+    second = metrics.stiffness[1]
     assert second.joint == 2
     assert second.torque_nm == pytest.approx(5.0)
     assert second.stiffness_nm_rad == pytest.approx(3.0 * 9.81**2 * 1.2, rel=0.01)
     # equal torques act on q1 + q2 alone: what joint 1 does is too little to tell, or very stiff
-    first = found.stiffness[0].stiffness_nm_rad
+    first = metrics.stiffness[0].stiffness_nm_rad
     assert first is None or abs(first) > 10.0 * second.stiffness_nm_rad
 
 
-def test_where_something_else_moves_arm_ratio_would_be_hands_own() -> None:
-    """`training`: the shares change, the hands do not; nothing is said, and surely not their 200 N m/rad."""
-    found = compute_log_metrics(simulated("training", {"rate_hz": 50}))
-    assert found.static_windows.value == 2.0
-    assert found.stiffness == []
+def test_no_stiffness_is_given_under_changing_shares() -> None:
+    """In `training` the shares change and the hands do not: no stiffness is stated, in
+    particular not their 200 N m/rad.
+    """
+    metrics = compute_log_metrics(simulated("training", {"rate_hz": 50}))
+    assert metrics.static_windows.value == 2.0
+    assert metrics.stiffness == []
 
 
 SLOW = {"rate_hz": 50}
 
 
-def test_a_hand_feels_what_the_shares_say() -> None:
+def test_the_felt_stiffness_follows_the_shares() -> None:
     """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
-    found = compute_log_metrics(simulated("force_sharing", SLOW))
-    assert [pair.pushed + pair.holds for pair in found.sharing_ratios] == ["sm1", "sm2", "sm2"]
-    assert [pair.felt_nm for pair in found.sharing_ratios] == pytest.approx(
+    metrics = compute_log_metrics(simulated("force_sharing", SLOW))
+    assert [pair.pushed + pair.holds for pair in metrics.sharing_ratios] == [
+        "sm1",
+        "sm2",
+        "sm2",
+    ]
+    assert [pair.felt_nm for pair in metrics.sharing_ratios] == pytest.approx(
         [4.79, 16.4, 5.0], rel=0.02
     )
-    assert [pair.pushed_nm for pair in found.sharing_ratios] == [pytest.approx(5.0)] * 3
-    assert [pair.joint for pair in found.sharing_ratios] == [1, 1, 1]
+    assert [pair.pushed_nm for pair in metrics.sharing_ratios] == [pytest.approx(5.0)] * 3
+    assert [pair.joint for pair in metrics.sharing_ratios] == [1, 1, 1]
     # beta = (0.444, 0.130, 0.426), Eq. (20): 1 - a23 a32, 1 - a13 a31, 1 - a12 a21
     beta = (1.0 - 0.2 * 0.2, 1.0 - 0.9 * 0.8, 1.0 - 0.1 * 0.8)
-    expected = [pair.expected_nm.value for pair in found.sharing_ratios]
+    expected = [pair.expected_nm.value for pair in metrics.sharing_ratios]
     assert expected == pytest.approx(
         [5.0 * beta[2] / beta[0], 5.0 * beta[2] / beta[1], 5.0], rel=1e-6
     )
-    assert found.run["sharing_off"].value <= 0.01
+    assert metrics.run["sharing_off"].value <= 0.01
 
 
 def test_three_loaded_sites_balance() -> None:
     """Stiffer sites count less: K_i enters, not the shares alone."""
     settings = {"sites.m1.control.Kp": 60.0, "duration_s": 15.0, **SLOW}
-    found = compute_log_metrics(simulated("force_sharing", settings))
-    assert found.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
-    assert found.sharing_ratios[0].off <= 0.01
-    assert found.joint_loads[0].imbalance.value <= 0.01
+    metrics = compute_log_metrics(simulated("force_sharing", settings))
+    assert metrics.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
+    assert metrics.sharing_ratios[0].off <= 0.01
+    assert metrics.joint_loads[0].imbalance.value <= 0.01
 
 
-def test_where_gravity_is_learnt_nothing_is_expected() -> None:
-    found = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
-    assert found.sharing_ratios
-    for one in found.sharing_ratios:
-        assert one.pushed == "s"
-        assert one.by_wall
-        assert one.holds == "m1"
-        assert one.expected_nm.value is None
-        assert "gravity is learnt" in one.expected_nm.why
-        assert one.off is None
+def test_with_learnt_gravity_no_sharing_is_expected() -> None:
+    metrics = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
+    assert metrics.sharing_ratios
+    for ratio in metrics.sharing_ratios:
+        assert ratio.pushed == "s"
+        assert ratio.by_wall
+        assert ratio.holds == "m1"
+        assert ratio.expected_nm.value is None
+        assert "gravity is learnt" in ratio.expected_nm.why
+        assert ratio.off is None
 
 
-def test_arms_that_move_share_nothing() -> None:
-    found = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
-    assert found.static_windows.value is None
+def test_moving_arms_have_no_force_sharing() -> None:
+    metrics = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
+    assert metrics.static_windows.value is None
     assert (
-        found.run["sharing_off"].why
+        metrics.run["sharing_off"].why
         == "no second in which all sites rest under constant torques"
     )
 
@@ -303,8 +302,8 @@ LEARNS = 'control = { law = "adaptive", Gamma = [1.0, 1.0, 2.0, 0.0, 0.0] }'
 THETA = [3.0, 1.0, 1.0, 2.0, 1.0]
 
 
-def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
-    """Learnt are the first three; off by (3, 4, 12) at t = 0, and by that less rate times time later."""
+def test_straight_estimates_have_distance_energy_and_slope() -> None:
+    """The first three are learnt; off by (3, 4, 12) at t = 0, and later by that less rate times time."""
     rate = [0.1, 0.2, -0.2]
 
     def motion(_: str, t_s: float) -> dict[str, list[float]]:
@@ -313,35 +312,35 @@ def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
         return {"theta_hat": [*learnt, 7.0, 8.0]}
 
     measured = compute_log_metrics(pair(motion, seconds=6.0, more=LEARNS))
-    found, learnt = measured.sites["s"], measured.estimates["s"]
-    assert found["theta_error_first"].value == pytest.approx(13.0)
-    assert found["theta_energy_first_j"].value == pytest.approx(
+    figures_of_slave, learnt = measured.sites["s"], measured.estimates["s"]
+    assert figures_of_slave["theta_error_first"].value == pytest.approx(13.0)
+    assert figures_of_slave["theta_energy_first_j"].value == pytest.approx(
         0.5 * (9.0 + 16.0 + 144.0 / 2.0)
     )
     end_s = 6.0 - 1.0 / 200
     last = [3.0 + 0.1 * end_s, 4.0 + 0.2 * end_s, 12.0 - 0.2 * end_s]
-    assert found["theta_error_last"].value == pytest.approx(math.hypot(*last))
-    assert found["theta_slope_per_s"].value == pytest.approx(0.3)
+    assert figures_of_slave["theta_error_last"].value == pytest.approx(math.hypot(*last))
+    assert figures_of_slave["theta_slope_per_s"].value == pytest.approx(0.3)
     assert learnt.slope_per_s == pytest.approx([*rate, 0.0, 0.0], abs=1e-9)
     assert learnt.learnt == [True, True, True, False, False]
     assert learnt.theta == THETA
 
 
-def test_a_law_that_learns_nothing_says_so() -> None:
-    found = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
-    assert found.value is None
-    assert found.why == "nothing is learnt"
-    assert not found.applies
+def test_a_law_without_estimates_is_reported() -> None:
+    figure = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
+    assert figure.value is None
+    assert figure.why == "nothing is learnt"
+    assert not figure.applies
 
 
-def test_without_a_truth_estimates_are_given_and_not_judged() -> None:
+def test_without_truth_estimates_have_no_error() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     changes = {
         "sites.s.plant": "external",
         "sites.s.arm.known": False,
         "sites.s.control.theta_hat0": THETA,
     }
-    measured = compute_log_metrics(under(log, changes))
+    measured = compute_log_metrics(replace_scenario(log, changes))
     assert measured.estimates["s"].theta is None
     assert measured.estimates["s"].last == log["s"].theta_hat[-1].tolist()
     assert measured.sites["s"]["theta_error_last"].why == "theta of the arm is not known"

@@ -1,4 +1,6 @@
-"""A metric is one file: whoever shows, compares or expects metrics knows one put beside the others."""
+"""A metric is one file: reports, comparisons and expectations find a metric that was put beside
+the others.
+"""
 
 from pathlib import Path
 
@@ -41,17 +43,17 @@ print(json.dumps({
 """
 
 
-def test_a_file_beside_the_others_is_a_metric_everywhere(tmp_path: Path) -> None:
+def test_an_added_file_is_a_metric_everywhere(tmp_path: Path) -> None:
     (tmp_path / "haste.py").write_text(METRIC)
-    found = look(LOOK, tmp_path)
-    assert 0.0 < found["json"] < found["compared"][0] == found["compared"][1]
-    assert "mean |qd|" in found["text"]
-    assert "haste_rad_s" in found["frame"]
-    assert 0.0 < found["swept"] != found["compared"][0]
-    assert ["metrics.haste_rad_s", True] in found["expected"]
+    output = look(LOOK, tmp_path)
+    assert 0.0 < output["json"] < output["compared"][0] == output["compared"][1]
+    assert "mean |qd|" in output["text"]
+    assert "haste_rad_s" in output["frame"]
+    assert 0.0 < output["swept"] != output["compared"][0]
+    assert ["metrics.haste_rad_s", True] in output["expected"]
 
 
-def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
+def test_duplicate_keys_are_refused_with_both_files() -> None:
     def measure_again(_view: RunView, _site: str) -> dict[str, object]:
         return {}
 
@@ -62,10 +64,10 @@ def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
 
 
 @pytest.mark.parametrize("name", ["free", "contact"])
-def test_a_measure_gives_the_quantities_that_it_declares(name: str) -> None:
+def test_a_measure_gives_its_declared_quantities(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
-    for one in list_measures():
-        for place in view.list_subjects(one.of):
-            assert set(one.measure(view, place)) == {
-                quantity.key for quantity in one.quantities
+    for measure in list_measures():
+        for subject in view.list_subjects(measure.of):
+            assert set(measure.measure(view, subject)) == {
+                quantity.key for quantity in measure.quantities
             }

@@ -1,4 +1,4 @@
-"""Energies: what the ports gave is in the arm, to the order of the scheme.
+"""Energies: the energy through the ports is in the arm, to the order of the scheme.
 
 The energy that a delay gives.
 """
@@ -14,10 +14,10 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.port_energy import held_work, trapezoid_work
 from trilat_net.scenario.arms import build_arm
 
-from .written import pair, simulated, under
+from .written import pair, replace_scenario, simulated
 
 
-def test_work_of_spring_is_exact_and_independent_of_way() -> None:
+def test_work_of_springs_is_exact_path_independent() -> None:
     """int -K q dq = K (q_0^2 - q_1^2) / 2."""
     q = np.cumsum(np.random.default_rng(1).normal(size=(50, 2)), axis=0)
     K = np.array([3.0, 7.0])
@@ -26,24 +26,24 @@ def test_work_of_spring_is_exact_and_independent_of_way() -> None:
     )
 
 
-def test_work_of_torque_that_is_held_is_torque_times_way() -> None:
+def test_held_torques_work_is_torque_times_path() -> None:
     q = np.array([[0.0, 1.0], [0.5, 1.0], [0.25, 3.0]])
     assert held_work(np.array([[2.0, 9.0], [4.0, 1.0]]), q).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
-def test_ports_make_up_the_mechanical_energy_to_second_order(scheme: str) -> None:
-    """1/2 qd'M qd + U grows by what controller and hands give; the held torque's work is exact."""
+def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
+    """1/2 qd'M qd + U grows by the energy of controller and hands; the held torque's work is exact."""
     rests = []
     for rate_hz in (100, 200):
         log = simulated("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme})
-        found = compute_log_metrics(log).sites
+        sites = compute_log_metrics(log).sites
         for site in log.sites:
             change = _mechanical(log, site)
-            assert found[site]["mechanical_j"].value == pytest.approx(
+            assert sites[site]["mechanical_j"].value == pytest.approx(
                 change[-1] - change[0], abs=1e-9
             )
-        rests.append(found["m1"]["unaccounted_j"].value)
+        rests.append(sites["m1"]["unaccounted_j"].value)
     assert rests[0] < 1e-3
     assert math.log2(rests[0] / rests[1]) == pytest.approx(2.0, abs=0.3)
 
@@ -56,17 +56,17 @@ def _mechanical(log, site: str):
     return kinetic + spec.arm.g_m_s2 * (theta[3] * np.sin(q1) + theta[4] * np.sin(q12))
 
 
-def test_a_lossless_wall_gives_back_no_more_than_it_took() -> None:
-    found = compute_log_metrics(
+def test_lossless_walls_return_at_most_their_energy() -> None:
+    metrics = compute_log_metrics(
         simulated("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250})
     ).sites["s"]
-    assert found["walls_j"].value <= 0.0
-    assert found["walls_most_j"].value <= 1e-6
+    assert metrics["walls_j"].value <= 0.0
+    assert metrics["walls_most_j"].value <= 1e-6
     # what is missing is in the spring: F^2 / 2 K at its last force of 3.3 N
-    assert found["walls_j"].value == pytest.approx(-(3.3**2) / 4000.0, rel=0.1)
+    assert metrics["walls_j"].value == pytest.approx(-(3.3**2) / 4000.0, rel=0.1)
 
 
-def test_a_damper_takes_what_the_formula_says() -> None:
+def test_a_damper_dissipates_by_the_formula() -> None:
     """int B (A w cos w t)^2 dt = B A^2 w^2 / 2 times the time, to second order of the period."""
     A, w, B = 0.2, 2.0 * math.pi, 4.0
 
@@ -78,10 +78,10 @@ def test_a_damper_takes_what_the_formula_says() -> None:
     more = 'environment = [{ kind = "viscous", damping_nm_s_rad = 4.0 }]'
     log = pair(motion, more=more)
     spent = B * A**2 * w**2 / 2.0 * log["s"].t_s[-1]
-    found = compute_log_metrics(log).sites["s"]
-    assert found["walls_j"].value == pytest.approx(-spent, rel=2e-3)
-    assert found["walls_most_j"].value == 0.0
-    assert found["hands_j"].value == pytest.approx(0.0, abs=1e-9)
+    figures = compute_log_metrics(log).sites["s"]
+    assert figures["walls_j"].value == pytest.approx(-spent, rel=2e-3)
+    assert figures["walls_most_j"].value == 0.0
+    assert figures["hands_j"].value == pytest.approx(0.0, abs=1e-9)
 
 
 def test_periods_without_both_records_are_left_out() -> None:
@@ -99,20 +99,22 @@ def test_periods_without_both_records_are_left_out() -> None:
 
 
 def test_an_unknown_arm_has_no_mechanical_energy() -> None:
-    """What the ports gave is known all the same; an arm outside of the program was told tau."""
+    """The energy through the ports is known all the same; an external arm was given tau."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    outside = under(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
-    found, before = (compute_log_metrics(one).sites["s"] for one in (outside, log))
-    assert found["mechanical_j"].value is None
-    assert found["mechanical_j"].why == "theta of the arm is not known"
+    outside = replace_scenario(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
+    outside_figures, before = (
+        compute_log_metrics(measured_log).sites["s"] for measured_log in (outside, log)
+    )
+    assert outside_figures["mechanical_j"].value is None
+    assert outside_figures["mechanical_j"].why == "theta of the arm is not known"
     part = log["s"]
     expected = float(np.trapezoid((part.tau * part.qd).sum(axis=1), part.t_s))
-    assert found["controller_j"].value == pytest.approx(expected, rel=1e-2)
+    assert outside_figures["controller_j"].value == pytest.approx(expected, rel=1e-2)
     assert before["mechanical_j"].value is not None
 
 
-@pytest.mark.parametrize("apart", [1.0, -1.0])
-def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
+@pytest.mark.parametrize("distance", [1.0, -1.0])
+def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
     """int qd K (q_j(t - T) - q_j(t)) dt = -K A_i A_j pi sin(w T) a second at w = 2 pi.
 
     Arms that move against each other are given energy, arms that move together lose it.
@@ -120,7 +122,7 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
     A, w, K, delay_s = 0.2, 2.0 * math.pi, 10.0, 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
-        sign = apart if site == "s" else 1.0
+        sign = distance if site == "s" else 1.0
         wave = {
             "q": [sign * A * math.sin(w * t_s), 0.0],
             "qd": [sign * A * w * math.cos(w * t_s), 0.0],
@@ -128,18 +130,18 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
         return {**wave, "tau": [0.0, 0.0], "tau_x": [0.0, 0.0]}
 
     seconds = 10.0
-    found = compute_log_metrics(pair(motion, seconds=seconds)).links["m->s"]
+    figures = compute_log_metrics(pair(motion, seconds=seconds)).links["m->s"]
     # until the first sample comes the peer is at its start pose
     begun = 0.5 * w * delay_s / math.pi
-    expected = -apart * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
-    assert found["delay_j"].value == pytest.approx(expected, rel=2e-3)
+    expected = -distance * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
+    assert figures["delay_j"].value == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("law", ["pd_d", "adaptive", "p_d"])
-def test_delays_are_what_port_has_beyond_law_without_them(law: str) -> None:
+def test_delay_energy_is_the_ports_excess(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
     log = simulated("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law})
-    found, largest = compute_log_metrics(log), 0.0
+    metrics, largest = compute_log_metrics(log), 0.0
     for site in log.sites:
         part, spec = log[site], log.scenario.sites[site]
         shares = log.scenario.dominance[site]
@@ -151,11 +153,11 @@ def test_delays_are_what_port_has_beyond_law_without_them(law: str) -> None:
         torque = LAWS[law](spec, part, e, ed)
         prompt = float(np.trapezoid((torque * part.qd).sum(axis=1), part.t_s))
         late = sum(
-            found.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer]
+            metrics.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer]
         )
-        given = found.sites[site]["controller_j"].value
+        controller_j = metrics.sites[site]["controller_j"].value
         scale = float(np.trapezoid(np.abs((torque * part.qd).sum(axis=1)), part.t_s))
-        assert prompt + late == pytest.approx(given, abs=2e-4 * scale)
+        assert prompt + late == pytest.approx(controller_j, abs=2e-4 * scale)
         largest = max(largest, abs(late) / scale)
     assert largest > 5e-3  # and that is no small part
 
@@ -181,15 +183,15 @@ def _regressed(spec, part, v, a, theta):
 LAWS = {"pd_d": _pd, "p_d": _pd, "adaptive": _adaptive}
 
 
-def test_direct_force_reflection_counts_the_force_that_comes_late() -> None:
-    """Where the slave meets no wall, no force is late, and the master's law sees nothing of its peer."""
+def test_force_reflection_counts_only_late_force() -> None:
+    """If the slave meets no wall, no force is late, and the master's law sees nothing of its peer."""
     calm = simulated("contact", {"duration_s": 3.0, "rate_hz": 200, "sites.s.environment": []})
     assert compute_log_metrics(calm).links["s->m"]["delay_j"].value == 0.0
     pushed = simulated("contact", {"duration_s": 3.0, "rate_hz": 200})
     assert compute_log_metrics(pushed).links["s->m"]["delay_most_j"].value > 0.0
 
 
-def test_a_law_of_somebodys_own_is_not_judged() -> None:
+def test_a_users_own_law_is_not_judged() -> None:
     log = simulated(
         "free", {"duration_s": 0.2, "rate_hz": 100, "control.law": "tests.laws:Adaptive"}
     )

@@ -1,4 +1,4 @@
-"""Errors, spread and following, of motions whose figures are known in closed form."""
+"""Errors, spread and following, for motions whose figures are known in closed form."""
 
 import math
 
@@ -23,41 +23,43 @@ def test_rms_and_peak_of_a_sinusoid() -> None:
         wave = size * math.sin(2.0 * math.pi * t_s)
         return {"q": [1.0 + wave, 2.0 + 0.5 * wave], "q_des": [1.0, 2.0]}
 
-    found = compute_log_metrics(pair(motion)).sites
-    assert found["s"]["rms_error_rad"].value == pytest.approx(0.3 / math.sqrt(2.0), rel=1e-9)
-    assert found["m"]["rms_error_rad"].value == pytest.approx(0.1 / math.sqrt(2.0), rel=1e-9)
-    assert found["s"]["max_error_rad"].value == pytest.approx(0.3, rel=1e-12)
+    sites = compute_log_metrics(pair(motion)).sites
+    assert sites["s"]["rms_error_rad"].value == pytest.approx(0.3 / math.sqrt(2.0), rel=1e-9)
+    assert sites["m"]["rms_error_rad"].value == pytest.approx(0.1 / math.sqrt(2.0), rel=1e-9)
+    assert sites["s"]["max_error_rad"].value == pytest.approx(0.3, rel=1e-12)
 
 
 def test_settling_is_the_last_time_above_the_limit() -> None:
     """exp(-t) sinks below 0.01 rad at t = ln 100."""
     log = pair(lambda _, t_s: {"q": [math.exp(-t_s), 0.0], "q_des": [0.0, 0.0]}, seconds=6.0)
-    found = compute_log_metrics(log).sites["m"]
-    assert found["settle_s"].value == pytest.approx(math.log(100.0), abs=1.0 / RATE_HZ)
-    assert found["max_error_end_rad"].value == pytest.approx(math.exp(-5.0), rel=2.0 / RATE_HZ)
+    figures = compute_log_metrics(log).sites["m"]
+    assert figures["settle_s"].value == pytest.approx(math.log(100.0), abs=1.0 / RATE_HZ)
+    assert figures["max_error_end_rad"].value == pytest.approx(
+        math.exp(-5.0), rel=2.0 / RATE_HZ
+    )
 
 
-def test_what_has_not_settled_says_so() -> None:
-    found = compute_log_metrics(pair(lambda _, __: {"q": [0.5, 0.0], "q_des": [0.0, 0.0]}))
-    settled = found.sites["m"]["settle_s"]
+def test_an_unsettled_run_is_reported() -> None:
+    metrics = compute_log_metrics(pair(lambda _, __: {"q": [0.5, 0.0], "q_des": [0.0, 0.0]}))
+    settled = metrics.sites["m"]["settle_s"]
     assert settled.value is None
     assert "exceeds 0.01 rad" in settled.why
 
 
-def test_following_looks_back_and_the_spread_does_not() -> None:
-    """A slave that is exactly its master's past: nothing is left of q_m(t - T) - q_s, v T of the spread."""
+def test_following_allows_for_delay_unlike_spread() -> None:
+    """A slave that is exactly its master's past: q_m(t - T) - q_s is zero, and the spread is v T."""
     speed, delay_s = 0.4, 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         past = t_s if site == "m" else max(0.0, t_s - delay_s)
         return {"q": [speed * past, -0.5 * speed * past]}
 
-    found = compute_log_metrics(pair(motion))
-    assert found.links["m->s"]["following_max_rad"].value == pytest.approx(0.0, abs=1e-12)
-    assert found.run["spread_max_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
-    assert found.run["spread_end_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
-    assert found.links["s->m"]["following_max_rad"].value is None
-    assert not found.links["s->m"]["following_max_rad"].applies
+    metrics = compute_log_metrics(pair(motion))
+    assert metrics.links["m->s"]["following_max_rad"].value == pytest.approx(0.0, abs=1e-12)
+    assert metrics.run["spread_max_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
+    assert metrics.run["spread_end_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
+    assert metrics.links["s->m"]["following_max_rad"].value is None
+    assert not metrics.links["s->m"]["following_max_rad"].applies
 
 
 def test_undelayed_error_includes_what_the_delay_costs() -> None:
@@ -93,23 +95,23 @@ def test_undelayed_error_weighs_peers_by_dominance() -> None:
     assert sites["s"]["undelayed_max_rad"].value == pytest.approx(error.max(), rel=1e-12)
 
 
-def test_the_delay_of_following_is_the_one_in_use() -> None:
-    """Where older samples are in use than the link says, the master's angles are those of their stamps."""
+def test_following_uses_the_delay_in_use() -> None:
+    """If older samples are in use than the link states, the master's angles are those of their stamps."""
 
     def motion(site: str, t_s: float) -> dict[str, object]:
         tick = round(t_s * RATE_HZ)
         used = {"m": max(-1, tick - 37)} if site == "s" else {"s": max(-1, tick - 10)}
         return {"q": [t_s, 0.0], "used": used}
 
-    found = compute_log_metrics(pair(motion)).links["m->s"]
-    assert found["following_rms_rad"].value == pytest.approx(37 / RATE_HZ, rel=1e-9)
-    assert found["age_mean_ms"].value == pytest.approx(37 / RATE_HZ * 1e3, rel=1e-9)
+    figures = compute_log_metrics(pair(motion)).links["m->s"]
+    assert figures["following_rms_rad"].value == pytest.approx(37 / RATE_HZ, rel=1e-9)
+    assert figures["age_mean_ms"].value == pytest.approx(37 / RATE_HZ * 1e3, rel=1e-9)
 
 
 def test_instants_with_a_missing_record_do_not_count() -> None:
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
-        apart = 5.0 if site == "s" and 1.0 <= t_s < 1.5 else 0.25
-        return {"q": [apart if site == "s" else 0.0, 0.0]}
+        error_rad = 5.0 if site == "s" and 1.0 <= t_s < 1.5 else 0.25
+        return {"q": [error_rad if site == "s" else 0.0, 0.0]}
 
     whole = pair(motion)
     torn = rewritten(whole, lambda state: not (state.site == "m" and 200 <= state.tick < 300))
@@ -117,8 +119,8 @@ def test_instants_with_a_missing_record_do_not_count() -> None:
     assert compute_log_metrics(torn).run["spread_max_rad"].value == 0.25
 
 
-def test_the_latest_record_is_of_the_tick_that_was() -> None:
+def test_the_latest_record_is_the_last_tick() -> None:
     track = align_records(pair(lambda _, __: {}))["m"]
-    row, there = find_latest_rows(track, np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
+    row, exists = find_latest_rows(track, np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
     assert row.tolist() == [0, 0, 1, 799, 799, 0]
-    assert there.tolist() == [True, True, True, True, False, False]
+    assert exists.tolist() == [True, True, True, True, False, False]

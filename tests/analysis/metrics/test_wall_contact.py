@@ -1,4 +1,4 @@
-"""Walls: what they are met with, in closed form and as a scenario's figures say."""
+"""Contact with walls, in closed form and against the figures in a scenario's text."""
 
 import math
 
@@ -32,7 +32,7 @@ def swinging(_: str, t_s: float) -> dict[str, list[float]]:
 def test_force_depth_and_hits_of_a_swing() -> None:
     """2 cos q > 1.9 m twice a period; K depth - B outward speed, never pulling."""
     log = pair(swinging, more=WALL)
-    found = compute_log_metrics(log).walls["s/1"]
+    figures = compute_log_metrics(log).walls["s/1"]
     force = []
     for t_s in log["s"].t_s.tolist():
         pose = swinging("s", t_s)
@@ -42,28 +42,28 @@ def test_force_depth_and_hits_of_a_swing() -> None:
         )
         force.append(max(0.0, 1000.0 * depth + 20.0 * inward) if depth > 0.0 else 0.0)
     mean = sum(force) / len(force)
-    assert found["force_mean_n"].value == pytest.approx(mean, rel=1e-9)
-    deviation = math.sqrt(sum((one - mean) ** 2 for one in force) / len(force))
-    assert found["force_deviation_n"].value == pytest.approx(deviation, rel=1e-9)
-    assert found["force_peak_n"].value == pytest.approx(max(force), rel=1e-9)
-    assert found["depth_max_m"].value == pytest.approx(0.1, rel=1e-4)
-    assert found["hits"].value == 8.0
-    assert found["contact_share"].value == pytest.approx(
-        sum(one > 0.0 for one in force) / len(force)
+    assert figures["force_mean_n"].value == pytest.approx(mean, rel=1e-9)
+    deviation = math.sqrt(sum((sample - mean) ** 2 for sample in force) / len(force))
+    assert figures["force_deviation_n"].value == pytest.approx(deviation, rel=1e-9)
+    assert figures["force_peak_n"].value == pytest.approx(max(force), rel=1e-9)
+    assert figures["depth_max_m"].value == pytest.approx(0.1, rel=1e-4)
+    assert figures["hits"].value == 8.0
+    assert figures["contact_share"].value == pytest.approx(
+        sum(sample > 0.0 for sample in force) / len(force)
     )
 
 
-def test_who_touches_from_the_first_record_on_has_not_hit() -> None:
-    found = compute_log_metrics(
+def test_contact_from_the_first_record_is_no_hit() -> None:
+    metrics = compute_log_metrics(
         pair(lambda _, __: {"q": [0.0] * JOINTS, "qd": [0.0] * JOINTS}, more=WALL)
     ).walls["s/1"]
-    assert found["hits"].value == 0.0
-    assert found["contact_share"].value == 1.0
-    assert found["end_force_mean_n"].value == pytest.approx(100.0)
+    assert metrics["hits"].value == 0.0
+    assert metrics["contact_share"].value == 1.0
+    assert metrics["end_force_mean_n"].value == pytest.approx(100.0)
 
 
-def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
-    """Nobody knows since when it touches; and no number comes from records that are not there."""
+def test_contact_that_began_in_gaps_is_no_hit() -> None:
+    """Its beginning is unknown; and missing records give no numbers."""
     whole = pair(swinging, more=WALL)
     torn = rewritten(
         whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140)
@@ -74,23 +74,23 @@ def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
     assert (before, after) == (8.0, 4.0)
 
 
-def test_contact_as_scenarios_tell_of_it() -> None:
+def test_contact_matches_the_scenario_text() -> None:
     """20 ms: one hit, then 3.3 N."""
-    found = compute_log_metrics(
+    metrics = compute_log_metrics(
         simulated("contact", {"link.delay_ms": 20.0, "duration_s": 11.0, "rate_hz": 200})
     ).walls["s/1"]
-    assert found["hits"].value == 1.0
-    assert found["end_force_mean_n"].value == pytest.approx(3.3, abs=0.05)
-    assert found["end_force_deviation_n"].value < 0.01
+    assert metrics["hits"].value == 1.0
+    assert metrics["end_force_mean_n"].value == pytest.approx(3.3, abs=0.05)
+    assert metrics["end_force_deviation_n"].value < 0.01
 
 
 def test_contact_at_200_ms_hammers() -> None:
     """8 +- 14 N, peak 52 N."""
-    found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).walls["s/1"]
-    assert found["force_peak_n"].value == pytest.approx(52.0, abs=0.5)
-    assert found["end_force_mean_n"].value == pytest.approx(8.0, rel=0.15)
-    assert found["end_force_deviation_n"].value == pytest.approx(14.0, rel=0.05)
-    assert found["end_hits"].value >= 2.0
+    figures = compute_log_metrics(simulated("contact", {"rate_hz": 200})).walls["s/1"]
+    assert figures["force_peak_n"].value == pytest.approx(52.0, abs=0.5)
+    assert figures["end_force_mean_n"].value == pytest.approx(8.0, rel=0.15)
+    assert figures["end_force_deviation_n"].value == pytest.approx(14.0, rel=0.05)
+    assert figures["end_hits"].value >= 2.0
 
 
 def test_the_force_of_windup_creeps() -> None:

@@ -1,4 +1,4 @@
-"""Logs whose records are prescribed: written by the real writer, read by the real reader."""
+"""Logs with prescribed records: written by the real writer, read by the real reader."""
 
 import io
 from collections.abc import Callable, Mapping
@@ -47,7 +47,9 @@ def _base(seconds: float, more: str) -> Log:
 
 
 def pair(motion: Callable[[str, float], Fields], seconds: float = 4.0, more: str = "") -> Log:
-    """A log of a pair whose records are as `motion` says, by site and time; `more` is of the slave."""
+    """Writes a log of a pair whose records are given by `motion`, by site and time; `more` is
+    for the slave.
+    """
 
     def change(state: Any) -> Any:
         return msgspec.structs.replace(state, **motion(state.site, state.t_ns * 1e-9))
@@ -56,12 +58,12 @@ def pair(motion: Callable[[str, float], Fields], seconds: float = 4.0, more: str
 
 
 def simulated(name: str, overrides: Mapping[str, Any] | None = None) -> Log:
-    """A virtual run of a shipped scenario, made once per test session."""
+    """Returns a virtual run of a shipped scenario, made once per test session."""
     return runs.run(name, overrides).log
 
 
-def under(log: Log, overrides: Mapping[str, Any]) -> Log:
-    """The records of a log under a scenario that says something else."""
+def replace_scenario(log: Log, overrides: Mapping[str, Any]) -> Log:
+    """Returns the records of a log under a different scenario."""
     scenario = parse_scenario(log.scenario_text, "changed", dict(overrides))
     stream = io.BytesIO()
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, collect_provenance())

@@ -1,4 +1,4 @@
-"""A clock for players: it moves a little whenever somebody looks, so that looking until it is time ends."""
+"""A clock for players that moves a little at every reading, so that waiting loops end."""
 
 
 class LookedAt:

@@ -1,4 +1,4 @@
-"""What a log holds, by an independent reader; and logs whose messages lie as a test wants them."""
+"""The content of a log, by an independent reader; and logs whose messages are placed by a test."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,19 +20,19 @@ EPOCH_UNIX_NS = 1_700_000_000_000_000_000
 
 
 def payloads(path: Path) -> dict[str, list[bytes]]:
-    """Every payload of a finished file by topic, in file order, read by the `mcap` package."""
-    found: dict[str, list[bytes]] = {}
+    """Returns every payload of a finished file by topic, in file order, read by the `mcap` package."""
+    payloads_by_topic: dict[str, list[bytes]] = {}
     with path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
-            found.setdefault(channel.topic, []).append(message.data)
-    return found
+            payloads_by_topic.setdefault(channel.topic, []).append(message.data)
+    return payloads_by_topic
 
 
 def session_payloads(path: Path) -> dict[str, list[bytes]]:
-    """The same, of what sites published: by member and channel, as in "m1/state"."""
+    """Returns the same for the messages of sites: by member and channel, as in "m1/state"."""
     return {
-        "/".join(topic.split("/")[3:]): found
-        for topic, found in payloads(path).items()
+        "/".join(topic.split("/")[3:]): payload_list
+        for topic, payload_list in payloads(path).items()
         if topic.startswith("/trilat/") and "/recorder/" not in topic
     }
 

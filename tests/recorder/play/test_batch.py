@@ -1,4 +1,4 @@
-"""Messages held tight are the same messages."""
+"""Messages in packed batches are the same messages."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,8 +25,8 @@ def gathered(given: Messages, kept: MessageBatch | None = None) -> BatchBuilder:
 
 
 @given(messages)
-def test_every_payload_stays_with_its_channel_and_number(given: Messages) -> None:
-    """And what is there twice, as in two parts of one session, is there once."""
+def test_payloads_stay_with_channel_and_number(given: Messages) -> None:
+    """Duplicates, as in two parts of one session, appear once."""
     block = gathered(given).ordered()
     assert sorted(message[1:] for message in block.messages()) == sorted(
         {message[1:] for message in given}
@@ -37,7 +37,7 @@ def test_every_payload_stays_with_its_channel_and_number(given: Messages) -> Non
 
 
 @given(messages, st.integers(1, 7))
-def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, size: int) -> None:
+def test_pieces_and_own_bytes_are_the_whole(given: Messages, size: int) -> None:
     block = gathered(given).ordered()
     whole = list(block.messages())
     pieces = list(block.pieces(size))
@@ -48,7 +48,7 @@ def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, size: int)
 
 @given(messages, messages)
 def test_ordered_messages_may_be_ordered_again_with_more(one: Messages, two: Messages) -> None:
-    """For messages whose numbers ascend in the file, as they come of a log that misses nothing."""
+    """For messages whose numbers ascend in the file, as in a complete log."""
     rising = [
         (t_ns, channel, n, payload + b".")
         for n, (t_ns, channel, _, payload) in enumerate(one + two)

@@ -1,4 +1,4 @@
-"""A log that is read while it plays is the same log."""
+"""A log that is read while it plays gives the same messages."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -32,8 +32,10 @@ def joined(blocks: list[MessageBatch]) -> list[PlayedMessage]:
 def sorted_in(
     messages: list[PlayedMessage], *how: int, **limits: int
 ) -> tuple[list[PlayedMessage], int]:
-    found = list(sort_messages(messages, *how, **limits))
-    return joined([batch for batch, _ in found]), sum(strays for _, strays in found)
+    sorted_messages = list(sort_messages(messages, *how, **limits))
+    return joined([batch for batch, _ in sorted_messages]), sum(
+        strays for _, strays in sorted_messages
+    )
 
 
 @given(
@@ -45,7 +47,7 @@ def sorted_in(
 def test_messages_within_the_horizon_are_put_in_order(
     steps: list[tuple[int, int, int]], step_ns: int
 ) -> None:
-    """Messages come up to 30 ns late in the file; a channel's times go with its numbers."""
+    """Messages come up to 30 ns late in the file; a channel's times ascend with its numbers."""
     t_ns, made = 0, [0, 0, 0]
     sent = []
     for step, channel, delay in steps:
@@ -56,19 +58,19 @@ def test_messages_within_the_horizon_are_put_in_order(
     assert sorted_in(messages, 30, step_ns) == (whole(messages), 0)
 
 
-def test_what_stands_further_away_is_played_all_same_and_counted() -> None:
+def test_distant_messages_are_played_and_counted() -> None:
     rising = [(t, 0, t, b"") for t in range(1, 100)]
     played, strays = sorted_in([*rising, (0, 0, 0, b"stray")], 30, 10)
     assert (len(played), strays) == (100, 1)
 
 
-def test_a_time_before_the_epoch_is_too_far_away() -> None:
+def test_times_before_the_epoch_are_too_far() -> None:
     before = [(t, 0, t, b"") for t in range(-50, 50)]
     assert sorted_in(before, 30, 10) == (before, 0)
 
 
 def test_messages_beyond_the_memory_limit_are_given_early() -> None:
-    """A file that says that everything was sent at once."""
+    """A file in which all messages have one time."""
     given = [(0, 0, n, bytes(100)) for n in range(1000)]
     assert sorted_in(given, limit_bytes=20_000) == (given, 0)
     assert (
@@ -86,7 +88,7 @@ def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionH
     source.close()  # again
 
 
-def taken(source: MessageSource) -> list[MessageBatch]:
+def read_batches(source: MessageSource) -> list[MessageBatch]:
     blocks = []
 
     def over() -> bool:
@@ -101,11 +103,11 @@ def taken(source: MessageSource) -> list[MessageBatch]:
 
 def rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
     for _ in range(count):
-        yield joined(taken(source))
+        yield joined(read_batches(source))
         source.restart()
 
 
-def test_a_process_of_its_own_gives_the_same_rounds(log_file: Path) -> None:
+def test_reading_processes_give_the_same_rounds(log_file: Path) -> None:
     preloaded, block = loaded(log_file)
     with reading(log_file, loop=True) as (source, header):
         assert list(rounds(source, 3)) == [list(block.messages())] * 3
@@ -125,7 +127,7 @@ def _killed(source: MessageSource, _path: Path) -> None:
         (_killed, RuntimeFault, "the process that reads the log ended with exit code -9"),
     ],
 )
-def test_what_the_process_cannot_read_is_an_error_here(
+def test_unreadable_messages_are_errors_here(
     happens: Callable[[MessageSource, Path], None],
     error: type[Exception],
     says: str,
@@ -140,7 +142,7 @@ def test_what_the_process_cannot_read_is_an_error_here(
             list(rounds(source, 1000))
 
 
-def test_a_process_whose_player_is_gone_ends_by_itself(log_file: Path) -> None:
+def test_processes_without_player_end_alone(log_file: Path) -> None:
     ours, theirs = Pipe(duplex=False)
     reader = get_context("spawn").Process(
         target=feed_player, args=(theirs, [log_file], PlaySelection(), True), daemon=True

@@ -1,4 +1,4 @@
-"""When messages are due, as a function of their times."""
+"""The due times of messages, as a function of their times."""
 
 import math
 
@@ -25,14 +25,12 @@ paces = st.builds(Pace, st.integers(0, 10**15), times, rates)
 
 
 @given(paces, times, times)
-def test_what_is_later_in_the_log_is_never_due_earlier(
-    pace: Pace, one: int, other: int
-) -> None:
+def test_later_messages_are_never_due_earlier(pace: Pace, one: int, other: int) -> None:
     assert (pace.due_ns(min(one, other))) <= pace.due_ns(max(one, other))
 
 
 @given(paces, times)
-def test_deadline_is_origin_and_what_passed_by_rate(pace: Pace, t_ns: int) -> None:
+def test_deadlines_follow_origin_and_rate(pace: Pace, t_ns: int) -> None:
     assert pace.due_ns(pace.start_ns) == pace.origin_ns
     passed_ns = pace.due_ns(t_ns) - pace.origin_ns
     if math.isinf(pace.rate):
@@ -44,9 +42,7 @@ def test_deadline_is_origin_and_what_passed_by_rate(pace: Pace, t_ns: int) -> No
 
 
 @given(paces, st.integers(0, 10**13), times)
-def test_the_next_round_is_the_same_by_so_much_later(
-    pace: Pace, length_ns: int, t_ns: int
-) -> None:
+def test_rounds_are_shifted_by_their_length(pace: Pace, length_ns: int, t_ns: int) -> None:
     later_ns = pace.due_ns(pace.start_ns + length_ns) - pace.origin_ns
     assert pace.later(length_ns).due_ns(t_ns) == pace.due_ns(t_ns) + later_ns
 
@@ -81,7 +77,7 @@ def test_rates(text: str, rate: float) -> None:
 
 
 @pytest.mark.parametrize("text", ["-1", "nan", "inf", "", "fast", "1e-4", "1001", "1e-300"])
-def test_what_is_no_rate_is_refused_with_what_would_be(text: str) -> None:
+def test_invalid_rates_are_refused_with_an_example(text: str) -> None:
     with pytest.raises(
         UsageError,
         match=r"rate, the speed relative to the recorded run, must be from 0\.001 to 1000, or",
@@ -102,7 +98,7 @@ def test_quantiles_are_those_of_the_whole_microseconds(late_ns: list[int]) -> No
     assert summary.max_us == counted.max_us == max(whole)
 
 
-def test_what_is_very_late_is_still_known_at_its_worst() -> None:
+def test_extreme_lateness_keeps_its_maximum() -> None:
     counted = LatenessHistogram()
     for late_us in (5, 3 * LATENESS_LIMIT_US, 2 * LATENESS_LIMIT_US):
         counted.add(late_us * 1000)

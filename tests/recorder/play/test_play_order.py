@@ -21,36 +21,42 @@ def ordered(given: Messages) -> tuple[list[int], list[int]]:
 
 
 @given(messages)
-def test_every_message_comes_once_and_times_never_go_back(given: Messages) -> None:
+def test_messages_come_once_in_time_order(given: Messages) -> None:
     order, due_ns = ordered(given)
     assert sorted(order) == list(range(len(given)))
     assert due_ns == sorted(due_ns)
 
 
 @given(messages)
-def test_a_channel_plays_in_order_of_its_numbers(given: Messages) -> None:
+def test_channels_play_in_order_of_their_numbers(given: Messages) -> None:
     order, _ = ordered(given)
     for channel in range(4):
-        own = [(given[place][2], place) for place in order if given[place][1] == channel]
-        assert own == sorted(own)
+        own_places = [
+            (given[message_index][2], message_index)
+            for message_index in order
+            if given[message_index][1] == channel
+        ]
+        assert own_places == sorted(own_places)
 
 
 @given(messages)
-def test_none_is_due_late_and_early_only_for_later_numbers(given: Messages) -> None:
+def test_messages_are_early_only_before_later_numbers(given: Messages) -> None:
     order, due_ns = ordered(given)
-    for place, due in zip(order, due_ns, strict=True):
-        t_ns, channel, number = given[place]
+    for message_index, due in zip(order, due_ns, strict=True):
+        t_ns, channel, number = given[message_index]
         behind = [
-            t for n, (t, c, k) in enumerate(given) if c == channel and (k, n) >= (number, place)
+            t
+            for n, (t, c, k) in enumerate(given)
+            if c == channel and (k, n) >= (number, message_index)
         ]
         assert due == min(behind) <= t_ns
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2)), max_size=30))
-def test_numbers_in_file_order_make_it_a_sort_by_time(
+def test_ascending_numbers_give_a_time_sort(
     given: list[tuple[int, int]],
 ) -> None:
-    """As in every log whose recorder missed nothing; channels' times there never go back."""
+    """As in every complete log; channels' times there never go back."""
     latest: dict[int, int] = {}
     rising = []
     for number, (step, channel) in enumerate(given):
@@ -61,8 +67,8 @@ def test_numbers_in_file_order_make_it_a_sort_by_time(
     assert due_ns == [rising[n][0] for n in order]
 
 
-def test_a_record_filled_in_later_is_played_in_its_place() -> None:
-    """By its time of sending; and by its time of arrival right before the one that it belongs before."""
+def test_records_filled_in_later_play_in_place() -> None:
+    """By its time of sending; and by its time of arrival right before its successor."""
     state, other = 0, 1
     by_sending = [(0, state, 0), (2, state, 2), (2, other, 0), (1, state, 1)]
     assert ordered(by_sending) == ([0, 3, 1, 2], [0, 1, 2, 2])

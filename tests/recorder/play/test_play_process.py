@@ -1,6 +1,6 @@
-"""A whole replay on a bus inside this process: what others find, and what they get.
+"""A whole replay on a bus inside this process, as seen and received by other members.
 
-Whoever watches acts when a message comes to it, which on this bus is while it is published.
+A watcher acts when a message arrives, which on this bus is while the message is published.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.net.local_bus import LocalNetwork
-from tests.net.parties import told
+from tests.net.parties import answer_info
 from tests.net.waiting import drained
 from trilat_net.app.play.message_source import MessageSource
 from trilat_net.app.play.play_process import (
@@ -44,7 +44,7 @@ TICKS = 300
 
 @dataclass
 class Hall:
-    """A replay and somebody who watches it, with what it does when so many messages have come."""
+    """A replay and a watcher that acts after a given number of messages."""
 
     log: Path
     options: PlayOptions = field(default_factory=lambda: PlayOptions(SESSION))
@@ -95,12 +95,12 @@ class Hall:
 
 
 class Scribe:
-    """Somebody who says that he is a recorder, and that he has everything."""
+    """A member that announces itself as a recorder that has every record."""
 
     def __init__(self, hall: Hall, *, stores: bool = True) -> None:
         bus = hall.network.join()
         session = hall.options.session
-        info = told(topics.RECORDER, RECORDER_BOOT)
+        info = answer_info(topics.RECORDER, RECORDER_BOOT)
         bus.respond(topics.key(session, topics.RECORDER, topics.INFO), lambda _: encode(info))
         bus.announce(liveliness_token(session, topics.RECORDER, RECORDER_BOOT))
         publish = bus.publisher(topics.key(session, topics.RECORDER, topics.EVENT))
@@ -120,12 +120,12 @@ class Scribe:
         bus.tap(topics.key(session, "*", topics.EVENT), hear)
 
 
-def test_every_payload_comes_in_the_order_of_its_channel(log_file: Path) -> None:
+def test_payloads_come_in_order_of_their_channel(log_file: Path) -> None:
     hall = Hall(log_file)
     outcome = hall.play()
     assert hall.heard == session_payloads(log_file)
     assert outcome.counts == {
-        f"/trilat/paper/{key}": len(found) for key, found in hall.heard.items()
+        f"/trilat/paper/{key}": len(payload_list) for key, payload_list in hall.heard.items()
     }
     assert (outcome.rounds, outcome.cut, outcome.strays, outcome.recorders) == (1, 0, 0, 0)
     assert outcome.lateness is not None
@@ -133,7 +133,7 @@ def test_every_payload_comes_in_the_order_of_its_channel(log_file: Path) -> None
 
 
 @pytest.mark.parametrize(("rate", "start_ns"), [(1.0, None), (2.0, 50_000_000)])
-def test_who_asks_finds_a_session_that_runs(
+def test_visitors_find_a_running_session(
     log_file: Path, rate: float, start_ns: int | None
 ) -> None:
     hall = Hall(log_file, PlayOptions(SESSION, rate), PlaySelection(start_ns=start_ns))
@@ -186,14 +186,14 @@ def test_pings_are_answered_at_once(log_file: Path) -> None:
     assert {pong.member: pong.boot for pong in pongs} == hall.facts.boots
 
 
-def test_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
+def test_the_past_is_given_as_far_as_played(log_file: Path) -> None:
     hall = Hall(log_file)
     rings: list[Inbox] = []
 
     def ask() -> None:
         for first, last in ((0, 9), (40, 1000), (290, 299)):
-            wanted = BackfillRequest(channel="state", first=first, last=last)
-            rings.append(hall.ask("m2", topics.PAST, encode(wanted)))
+            backfill_request = BackfillRequest(channel="state", first=first, last=last)
+            rings.append(hall.ask("m2", topics.PAST, encode(backfill_request)))
         rings.append(
             hall.ask(
                 "s", topics.PAST, encode(BackfillRequest(channel="link", first=0, last=99))
@@ -220,11 +220,11 @@ def test_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
     )
 
 
-def test_recorder_that_comes_in_middle_learns_when_tick_0_was(log_file: Path) -> None:
+def test_joining_recorders_learn_tick_0(log_file: Path) -> None:
     """By the code of the recorder's own way into a session."""
     hall = Hall(log_file)
     bus = hall.network.join()
-    info = told(topics.RECORDER, RECORDER_BOOT)
+    info = answer_info(topics.RECORDER, RECORDER_BOOT)
     epochs: list[Epoch] = []
     begun: list[int] = []
     joining: list[SessionJoin] = []
@@ -246,7 +246,7 @@ def test_recorder_that_comes_in_middle_learns_when_tick_0_was(log_file: Path) ->
 
 
 @pytest.mark.parametrize(("stores", "stays_ns"), [(True, 0), (False, LINGER_NS)])
-def test_it_stays_until_recorder_has_everything_or_for_while(
+def test_replay_waits_for_the_recorder_briefly(
     log_file: Path, stores: bool, stays_ns: int
 ) -> None:
     hall = Hall(log_file, PlayOptions(SESSION, needs_recorder=True))
@@ -258,21 +258,21 @@ def test_it_stays_until_recorder_has_everything_or_for_while(
     assert hall.clock.now_ns - ended[-1] == pytest.approx(stays_ns, abs=200_000_000)
 
 
-def test_a_log_is_played_in_its_own_name(log_file: Path) -> None:
+def test_logs_play_under_their_own_name(log_file: Path) -> None:
     hall = Hall(
         log_file, PlayOptions("other"), PlaySelection(ChannelFilter(exclude=("**/link",)))
     )
     hall.play()
     wanted = {
-        key: found
-        for key, found in session_payloads(log_file).items()
+        key: payload_list
+        for key, payload_list in session_payloads(log_file).items()
         if not key.endswith("link")
     }
     assert hall.heard == wanted
     assert {decode(payload, State).site for payload in hall.heard["m1/state"]} == {"m1"}
 
 
-def test_asked_to_end_it_leaves_in_order(log_file: Path) -> None:
+def test_replays_end_in_order_on_request(log_file: Path) -> None:
     hall = Hall(log_file, stop_at=100)
     outcome = hall.play()
     assert 100 <= sum(outcome.counts.values()) <= 110
@@ -280,7 +280,7 @@ def test_asked_to_end_it_leaves_in_order(log_file: Path) -> None:
     assert hall.network.members == [hall.watcher]
 
 
-def test_it_shows_where_it_is_twice_a_second(tmp_path: Path) -> None:
+def test_progress_is_shown_twice_a_second(tmp_path: Path) -> None:
     hall = Hall(write(tmp_path / "run.mcap", [("m1", n, 100 * n, 100 * n) for n in range(31)]))
     hall.play()
     positions = [progress.position_ns for progress in hall.shown]
@@ -288,20 +288,22 @@ def test_it_shows_where_it_is_twice_a_second(tmp_path: Path) -> None:
     assert 5 <= len(positions) <= 8
 
 
-def test_a_session_that_is_there_already_is_refused() -> None:
+def test_existing_sessions_are_refused() -> None:
     network, clock = LocalNetwork(), LookedAt()
-    visitor, there = network.join(), network.join()
-    there.respond(
-        topics.key("other", "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
+    visitor, playing = network.join(), network.join()
+    playing.respond(
+        topics.key("other", "m1", topics.INFO),
+        lambda _: encode(answer_info("m1", RECORDER_BOOT)),
     )
-    there.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
-    there.respond(
+    playing.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
+    playing.respond(
         topics.key(SESSION, "recorder", topics.INFO),
-        lambda _: encode(told("recorder", RECORDER_BOOT)),
+        lambda _: encode(answer_info("recorder", RECORDER_BOOT)),
     )
     refuse_running_session(visitor, clock, SESSION, lambda: False)
-    there.respond(
-        topics.key(SESSION, "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
+    playing.respond(
+        topics.key(SESSION, "m1", topics.INFO),
+        lambda _: encode(answer_info("m1", RECORDER_BOOT)),
     )
     with pytest.raises(
         SessionError, match="session 'replay-paper' already exists and is waiting to begin"
@@ -317,5 +319,5 @@ def test_a_session_that_is_there_already_is_refused() -> None:
         ("/trilat/other/m1/state", "trilat/again/trilat/other/m1/state"),
     ],
 )
-def test_keys_are_those_of_the_session_under_its_new_name(topic: str, key: str) -> None:
+def test_keys_use_the_new_session_name(topic: str, key: str) -> None:
     assert map_key_to_session(topic, "paper", "again") == key

@@ -1,4 +1,4 @@
-"""The player on a clock of the test's own: every message once, in order, when it is due."""
+"""The player on a clock of the test's own: every message once, in order, at its due time."""
 
 import math
 from collections.abc import Iterable
@@ -43,7 +43,7 @@ def given_at_once(given: Iterable[tuple[int, int]]) -> MessageSource:
 
 
 class Trickle:
-    """A source that gives its messages in pieces, and between two of them sometimes nothing."""
+    """A source that gives its messages in pieces, and sometimes nothing between two pieces."""
 
     whole, strays = False, 0
 
@@ -70,7 +70,7 @@ class Trickle:
 
 
 class Stage:
-    """What a player needs, and what came of it: (when, on which channel, what)."""
+    """The inputs of a player, and its output: (when, on which channel, what)."""
 
     def __init__(
         self, source: MessageSource | Trickle, *, low_cpu: bool = False, stop_at: int = 10**9
@@ -107,7 +107,7 @@ class Stage:
     rate=st.sampled_from([0.5, 1.0, 4.0, math.inf]),
     cuts=st.lists(st.integers(0, 60)),
 )
-def test_every_message_is_published_once_in_order_at_its_deadline(
+def test_messages_are_published_once_at_their_deadlines(
     given: list[tuple[int, int]], rate: float, cuts: list[int], low_cpu: bool
 ) -> None:
     whole = block(given)
@@ -133,8 +133,8 @@ def test_every_message_is_published_once_in_order_at_its_deadline(
         assert stage.memory.next_numbers == {c: n + 1 for _, c, n in stage.heard}
 
 
-def test_a_late_message_makes_no_later_one_late() -> None:
-    """A publisher that waits for 30 ms: what was due meanwhile follows at once, the rest is in time."""
+def test_late_messages_delay_no_later_ones() -> None:
+    """A publisher that waits for 30 ms: messages due meanwhile follow at once, all others are in time."""
     stage = Stage(given_at_once((t, 0) for t in range(60)))
     stage.stall_ns[10] = 30 * MS
     pace = stage.play()
@@ -145,14 +145,14 @@ def test_a_late_message_makes_no_later_one_late() -> None:
     assert stage.player.held_ns == pytest.approx(30 * MS, rel=0.01)
 
 
-def test_who_makes_a_publisher_wait_for_seconds_is_counted() -> None:
+def test_publishers_waiting_for_seconds_are_counted() -> None:
     stage = Stage(given_at_once([(0, 0), (1, 0)]))
     stage.stall_ns[1] = CUT_NS
     stage.play()
     assert stage.player.stalls == 1
 
 
-def test_rounds_follow_each_other_with_the_same_messages() -> None:
+def test_rounds_have_the_same_messages() -> None:
     stage = Stage(given_at_once([(0, 0), (5, 1), (7, 0)]), stop_at=7)
     pace = stage.play(later_ns=MS, loop=True)
     assert [n for _, _, n in stage.heard] == [0, 1, 2, 0, 1, 2, 0]
@@ -166,15 +166,15 @@ def test_rounds_follow_each_other_with_the_same_messages() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 5, 300])
-def test_it_stops_when_asked(count: int) -> None:
-    """Between two messages, and no later than it looks at anything else."""
+def test_players_stop_on_request(count: int) -> None:
+    """Between two messages, and no later than the next check."""
     stage = Stage(given_at_once((t % 60, 0) for t in range(250)), stop_at=count)
     stage.play()
     assert count <= len(stage.heard) <= count + 10 or len(stage.heard) == 250
 
 
-def test_other_tasks_have_their_turn_even_without_time_left() -> None:
-    """As fast as can be: a hundred times a second; and while nothing is due: a thousand times."""
+def test_other_tasks_run_without_spare_time() -> None:
+    """At the highest rate: a hundred times a second; and in idle times: a thousand times."""
     stage = Stage(given_at_once((0, 0) for _ in range(200)))
     for n in range(200):
         stage.stall_ns[n] = MS
@@ -190,7 +190,7 @@ def test_other_tasks_have_their_turn_even_without_time_left() -> None:
     assert [progress.published for _, progress in quiet.looks][-1] == 1
 
 
-def test_where_nothing_comes_nothing_is_played() -> None:
+def test_empty_sources_play_nothing() -> None:
     stage = Stage(Trickle([None, None]))
     assert stage.player.prepare() is None
     assert stage.player.lateness.summary() is None

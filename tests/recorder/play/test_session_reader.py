@@ -1,4 +1,4 @@
-"""What is read of a log for a replay."""
+"""Reading a log for a replay."""
 
 from pathlib import Path
 
@@ -18,14 +18,14 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 LARGE = 1 << 28
 
 
-def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -> None:
+def test_site_messages_are_read_byte_for_byte(log_file: Path) -> None:
     facts, block = loaded(log_file)
     played: dict[str, list[bytes]] = {topic: [] for topic in facts.topics}
     for _, channel, _, payload in block.messages():
         played[facts.topics[channel]].append(payload)
     published = {
-        topic: found
-        for topic, found in payloads(log_file).items()
+        topic: payload_list
+        for topic, payload_list in payloads(log_file).items()
         if topic.startswith("/trilat/")
     }
     assert played == published
@@ -36,7 +36,7 @@ def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -
     assert facts.torn == {}
 
 
-def test_numbers_are_ticks_of_records_and_places_of_the_rest(log_file: Path) -> None:
+def test_numbers_are_record_ticks_or_places(log_file: Path) -> None:
     facts, block = loaded(log_file)
     for channel, topic in enumerate(facts.topics):
         numbers = block.numbers[block.channels == channel].tolist()
@@ -44,17 +44,17 @@ def test_numbers_are_ticks_of_records_and_places_of_the_rest(log_file: Path) -> 
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_logs_of_older_versions_are_read_too(version: int) -> None:
+def test_older_log_versions_are_read(version: int) -> None:
     path = GOLDEN / f"v{version}.mcap"
     facts, block = loaded(path)
     assert facts.version == version
     assert set(facts.boots) == {"m1", "m2", "s"}
     read = sorted(payload for _, _, _, payload in block.messages())
-    assert read == sorted(p for found in payloads(path).values() for p in found)
+    assert read == sorted(p for payload_list in payloads(path).values() for p in payload_list)
 
 
 @given(start_ms=st.integers(-10, 250), length_ms=st.integers(11, 320))
-def test_a_window_is_read_and_nothing_else(
+def test_only_the_window_is_read(
     start_ms: int, length_ms: int, tmp_path_factory: TmpFactory
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "window.mcap"
@@ -66,7 +66,7 @@ def test_a_window_is_read_and_nothing_else(
     assert block.numbers.tolist() == list(range(first, last + 1))
 
 
-def test_times_are_those_of_sending_or_of_coming(tmp_path: Path) -> None:
+def test_times_are_sent_or_received(tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", [("m1", 0, -20, 5), ("s", 0, 1, 6), ("m1", 1, 3, 90)])
     for time, expected in (("publish", [-20, 1, 3]), ("log", [5, 6, 90])):
         _, block = loaded(path, time=time)
@@ -74,9 +74,9 @@ def test_times_are_those_of_sending_or_of_coming(tmp_path: Path) -> None:
 
 
 def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
-    one = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
+    first_part = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
     two = write(tmp_path / "2.mcap", [("m1", 1, 10, 30), ("m1", 2, 20, 30), ("m1", 3, 40, 40)])
-    facts, block = loaded(one, two)
+    facts, block = loaded(first_part, two)
     assert [payload for _, _, _, payload in block.messages()] == [
         event("m1", n) for n in range(4)
     ]
@@ -85,10 +85,10 @@ def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
     with pytest.raises(
         LogError, match=r"3\.mcap: belongs to a different session from .*1\.mcap"
     ):
-        preload_messages([one, other], PlaySelection(), LARGE)
+        preload_messages([first_part, other], PlaySelection(), LARGE)
 
 
-def test_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: Path) -> None:
+def test_torn_files_are_read_while_whole(short_log: bytes, tmp_path: Path) -> None:
     path = tmp_path / "torn.mcap"
     path.write_bytes(short_log[: len(short_log) * 95 // 100])
     facts, block = loaded(path)
@@ -96,7 +96,7 @@ def test_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: Pat
     assert facts.torn == {path: "the file was not finished"}
 
 
-def test_beyond_the_limit_a_log_is_read_while_it_plays(log_file: Path) -> None:
+def test_large_logs_are_read_while_playing(log_file: Path) -> None:
     for limit_bytes in (0, 50_000):
         facts, block = preload_messages([log_file], PlaySelection(), limit_bytes)
         assert block is None
@@ -118,14 +118,14 @@ def test_beyond_the_limit_a_log_is_read_while_it_plays(log_file: Path) -> None:
         ),
     ],
 )
-def test_where_nothing_can_be_played_the_choice_is_told(
+def test_empty_selections_explain_the_choice(
     selection: PlaySelection, problem: str, log_file: Path
 ) -> None:
     with pytest.raises(UsageError, match=problem):
         preload_messages([log_file], selection, LARGE)
 
 
-def test_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path) -> None:
+def test_nonsense_stamps_are_replaced_by_arrival_times(tmp_path: Path) -> None:
     path = write(
         tmp_path / "run.mcap",
         [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)],

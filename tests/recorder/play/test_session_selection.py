@@ -1,4 +1,4 @@
-"""What is played of a log."""
+"""The selection of a log's messages for a replay."""
 
 import pytest
 
@@ -16,27 +16,27 @@ TOPICS = [
 ]
 
 
-def taken(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
+def select_channels(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
     selection = parse_selection(include, exclude, None, None, None, "publish")
     return [topic for topic in TOPICS if selection.accepts(topic, SITES)]
 
 
-def test_by_default_all_that_sites_published_and_nothing_else() -> None:
-    assert taken() == TOPICS[:3]
+def test_default_is_all_messages_of_sites() -> None:
+    assert select_channels() == TOPICS[:3]
 
 
-def test_what_is_included_is_all_that_is_played() -> None:
-    assert taken(("/viz/**",)) == TOPICS[5:]
-    assert taken(("**/state", "trilat/*/s/*")) == [TOPICS[0], TOPICS[2]]
-    assert taken(("**",)) == TOPICS
+def test_included_channels_are_played_alone() -> None:
+    assert select_channels(("/viz/**",)) == TOPICS[5:]
+    assert select_channels(("**/state", "trilat/*/s/*")) == [TOPICS[0], TOPICS[2]]
+    assert select_channels(("**",)) == TOPICS
 
 
-def test_what_is_excluded_is_not_whatever_is_included() -> None:
-    assert taken(exclude=("**/link",)) == [TOPICS[0], TOPICS[2]]
-    assert taken(("**",), ("/trilat/**",)) == TOPICS[5:]
+def test_exclusion_overrides_inclusion() -> None:
+    assert select_channels(exclude=("**/link",)) == [TOPICS[0], TOPICS[2]]
+    assert select_channels(("**",), ("/trilat/**",)) == TOPICS[5:]
 
 
-def test_a_duration_counts_from_the_start_or_from_tick_0() -> None:
+def test_durations_count_from_start_or_tick_0() -> None:
     window = parse_selection((), (), 2.0, None, 0.5, "log")
     assert (window.start_ns, window.stop_ns, window.time) == (
         2_000_000_000,
@@ -58,7 +58,7 @@ def test_a_duration_counts_from_the_start_or_from_tick_0() -> None:
         (1e300, None, None, "start must be a number of seconds"),
     ],
 )
-def test_windows_that_cannot_be_meant(
+def test_invalid_windows_are_refused(
     start_s: float | None, stop_s: float | None, duration_s: float | None, problem: str
 ) -> None:
     with pytest.raises(UsageError, match=problem):

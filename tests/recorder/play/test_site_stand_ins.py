@@ -1,4 +1,4 @@
-"""What a replay tells of its past is what a site would."""
+"""A replay answers requests for the past like a site."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,9 +16,9 @@ def remembered(
 ) -> PlayedHistory:
     memory = PlayedHistory(kept_ns)
     gathering = BatchBuilder()
-    for place, number in enumerate(numbers):
-        gathering.add(place, CHANNEL, number, number.to_bytes(2, "big") * size)
-        gathering.add(place, OTHER, number, b"other")
+    for index, number in enumerate(numbers):
+        gathering.add(index, CHANNEL, number, number.to_bytes(2, "big") * size)
+        gathering.add(index, OTHER, number, b"other")
     for piece in gathering.ordered().pieces(40):
         memory.add(piece)
     if played:
@@ -27,9 +27,9 @@ def remembered(
 
 
 def naive(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
-    """From the first number there is, one after the other, as long as there is no gap."""
-    made = numbers[-1] + 1 if numbers else 0
-    if first >= made:
+    """Returns messages from the first number there is, one after the other, until a gap."""
+    next_number = numbers[-1] + 1 if numbers else 0
+    if first >= next_number:
         return first, []
     begin = next(n for n in numbers if n >= first)
     run = []
@@ -46,7 +46,7 @@ def naive(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
     st.integers(0, 130),
     st.integers(0, 130),
 )
-def test_it_answers_records_from_a_number_to_the_next_gap(
+def test_answers_go_up_to_the_next_gap(
     numbers: list[int], data: st.DataObject, first: int, more: int
 ) -> None:
     played = data.draw(st.integers(0, len(numbers)))
@@ -58,7 +58,7 @@ def test_it_answers_records_from_a_number_to_the_next_gap(
 
 
 @given(st.integers(0, 150), st.integers(0, 150), st.integers(0, 150), st.sampled_from([1, 900]))
-def test_where_nothing_is_missing_it_answers_as_a_site(
+def test_without_gaps_answers_equal_a_sites(
     count: int, first: int, more: int, size: int
 ) -> None:
     """Messages of 2 bytes, and of 1800, of which fewer fit an answer."""
@@ -66,25 +66,25 @@ def test_where_nothing_is_missing_it_answers_as_a_site(
     for number in range(count):
         ring.store(number.to_bytes(2, "big") * size)
     memory = remembered(list(range(count)), count, size)
-    told = memory.find_messages(CHANNEL, first, first + more)
-    assert told == ring.read_chunk(first, first + more)
-    assert sum(map(len, told[1])) <= BACKFILL_BYTES
+    messages = memory.find_messages(CHANNEL, first, first + more)
+    assert messages == ring.read_chunk(first, first + more)
+    assert sum(map(len, messages[1])) <= BACKFILL_BYTES
 
 
-def test_what_has_not_been_played_is_not_told() -> None:
+def test_unplayed_messages_are_not_sent() -> None:
     memory = remembered(list(range(30)), 10)
     assert len(memory.find_messages(CHANNEL, 0, 29)[1]) == 10
     assert memory.find_messages(CHANNEL, 10, 29) == (10, [])
 
 
-def test_what_is_older_than_is_remembered_is_gone() -> None:
+def test_forgotten_messages_are_missing() -> None:
     memory = remembered(list(range(200)), 200, kept_ns=50)
     first, payloads = memory.find_messages(CHANNEL, 0, 199)
     assert 130 <= first <= 150
     assert int.from_bytes(payloads[0], "big") == first
 
 
-def test_after_forgetting_all_before_is_gone() -> None:
+def test_forgetting_removes_everything_before() -> None:
     memory = remembered(list(range(30)), 30)
     memory.clear()
     assert memory.find_messages(CHANNEL, 3, 9) == (30, [])

@@ -27,8 +27,8 @@ from ...core.step.site_setup import Scheme, StaleAction
 from ...core.step.vectors import Array
 from ...errors import count_nouns
 from ...log.log_reader import Log
+from ...own_code.imported_code import ImportedLaw
 from ...results import JsonObject
-from ...scenario.imported_code import ImportedLaw
 from ...scenario.scenario_types import Scenario
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows

@@ -23,8 +23,8 @@ from ...core.step.ticks import BUCKETS_PER_S
 from ...core.step.vectors import Array
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.fused import FusedRun
+from ...own_code.imported_code import ImportedLaw
 from ...scenario import Scenario
-from ...scenario.imported_code import ImportedLaw
 from ...scenario.operators.kernel_operators import Chirp, Multisine
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop

@@ -37,10 +37,10 @@ from ...execution.fused import FusedRun
 from ...execution.virtual import simulate_scenario
 from ...log.log_reader import Log
 from ...log.record_columns import Ints
+from ...own_code.imported_code import ImportedLaw
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay
-from ...scenario.imported_code import ImportedLaw
 from ...scenario.sample_uses import draw_used_samples
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites

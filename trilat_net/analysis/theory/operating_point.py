@@ -38,9 +38,9 @@ from ...core.step.vectors import Array
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
 from ...laws.conditions import LinearForm, LinearSituation
+from ...own_code.imported_code import ImportedLaw
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
-from ...scenario.imported_code import ImportedLaw
 from ...scenario.sample_uses import draw_used_samples
 from ...scenario.validate import refuse_external_arms
 from ..delay_period import (

@@ -47,7 +47,7 @@ def sim_command(
     """
     from ...execution.virtual import record_virtual
     from ...log.view_rates import parse_viz_rate
-    from ...scenario.code_consent import find_user_laws
+    from ...own_code.code_consent import find_user_laws
     from ...scenario.validate import write_simulated_options
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)

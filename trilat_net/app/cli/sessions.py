@@ -38,7 +38,7 @@ def demo_command(
     run_and_report(run.load(scenario), run)
 
 
-class SessionPage(Protocol):
+class _SessionPage(Protocol):
     """A page in a browser that shows a session, and offers its results afterwards.
 
     The package trilat-people provides one. The commands use only these two methods, so that
@@ -78,7 +78,7 @@ def _describe_log(path: Path) -> str:
 
 
 def run_and_report(
-    chosen: "Scenario", run: options.RunOptions, page: "SessionPage | None" = None
+    chosen: "Scenario", run: options.RunOptions, page: "_SessionPage | None" = None
 ) -> None:
     """Runs a scenario live, then verifies its log and writes a report.
 

@@ -53,7 +53,7 @@ import numpy as np
 
 from ...records import MAX_JOINTS as MAX_JOINTS
 from ..step.jit import leaf
-from ..step.vectors import Array, Row, RowArray, Vector
+from ..step.vectors import Array, Row, RowArray, Vector, choose
 from .elementary import sincos
 
 LINK_PARAMETERS = 10
@@ -817,15 +817,12 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
         qd: Velocity of the joint, rad/s or m/s.
     """
     damper = row.stop_damping * qd
-    if q < row.lower:
-        spring = row.stop_stiffness * (row.lower - q)
-        push: float = spring - damper
-        return max(push, 0.0)
-    if q > row.upper:
-        spring = row.stop_stiffness * (row.upper - q)
-        push = spring - damper
-        return min(push, 0.0)
-    return 0.0
+    lower_spring = row.stop_stiffness * (row.lower - q)
+    upper_spring = row.stop_stiffness * (row.upper - q)
+    lower_push: float = max(lower_spring - damper, 0.0)
+    upper_push: float = min(upper_spring - damper, 0.0)
+    push_at_most = choose(q > row.upper, upper_push, 0.0)
+    return choose(q < row.lower, lower_push, push_at_most)
 
 
 @leaf

@@ -14,7 +14,7 @@ from math import isfinite
 from ..step.control import limit_torque, robust_torque
 from ..step.jit import leaf
 from ..step.site_setup import Law
-from ..step.vectors import Array, Row, RowArray, Vector
+from ..step.vectors import Array, Row, RowArray, Vector, choose
 from .chain import (
     find_acceleration,
     friction_torque,
@@ -136,10 +136,11 @@ def update_torque(s: Row, chain: RowArray) -> None:
             torque -= s.Kp[i] * s.r[i]
             # The inverse dynamics contain the friction in full.
             uncompensated = 1.0 - s.friction[i]
-            if uncompensated != 0.0:
-                torque -= uncompensated * friction_torque(chain[i], s.v[i])
-            if s.rho[i] > 0.0:
-                torque -= robust_torque(s.rho[i], s.width[i], s.r[i])
+            friction = uncompensated * friction_torque(chain[i], s.v[i])
+            torque = choose(uncompensated != 0.0, torque - friction, torque)
+            width = choose(s.rho[i] > 0.0, s.width[i], 1.0)
+            robust = robust_torque(s.rho[i], width, s.r[i])
+            torque = choose(s.rho[i] > 0.0, torque - robust, torque)
         else:
             torque -= s.d[i] * s.qd[i]
         s.tau[i] = limit_torque(torque, s.tau_limit[i])
@@ -287,21 +288,18 @@ def update_external_torque(
 
 
 @leaf
-def _put_acceleration(
+def put_stage_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
-
-    The torque is the held u plus the torque of the actors at the time and state of the stage.
+    """Writes the torque of operators and environments at a stage of the integrator.
 
     Args:
         t_s: Time of the stage, s since the epoch.
-        s: Row of the site, with `stage_q` and `stage_qd`.
-        chain: Rows of the joints.
+        s: Row of the site, with `stage_q` and `stage_qd`; `stage_torque` is written.
+        chain: Rows of the joints, placed at `stage_q`.
         actors: Rows of operators and environments.
         table: Their numbers, for example recorded torques.
     """
-    place_joints(chain, s.stage_q)
     put_torque_on_chain(
         t_s=t_s,
         q=s.stage_q,
@@ -313,6 +311,18 @@ def _put_acceleration(
         sampled=0,
         torque=s.stage_torque,
     )
+
+
+@leaf
+def put_stage_acceleration(s: Row, chain: RowArray) -> None:
+    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
+
+    The torque is the held u plus the torque of the actors at the time and state of the stage.
+
+    Args:
+        s: Row of the site, with `stage_q`, `stage_qd` and `stage_torque`.
+        chain: Rows of the joints, placed at `stage_q`.
+    """
     for i in range(chain.shape[0]):
         s.stage_torque[i] += s.u[i]
     find_acceleration(
@@ -327,7 +337,25 @@ def _put_acceleration(
 
 
 @leaf
-def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
+def _put_acceleration(
+    t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
+
+    Args:
+        t_s: Time of the stage, s since the epoch.
+        s: Row of the site, with `stage_q` and `stage_qd`.
+        chain: Rows of the joints.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+    """
+    place_joints(chain, s.stage_q)
+    put_stage_torque(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
+    put_stage_acceleration(s, chain)
+
+
+@leaf
+def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
     """Completes a stage of the Runge-Kutta method, and prepares the next stage.
 
     The method integrates the joint positions q and velocities qd over a period h. A stage is
@@ -354,6 +382,49 @@ def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
         # The order matters: the next `stage_q` needs the `stage_qd` of this stage.
         s.stage_q[i] = s.q[i] + ahead_s * s.stage_qd[i]
         s.stage_qd[i] = s.qd[i] + ahead_s * s.stage_qdd[i]
+
+
+@leaf
+def begin_stages(s: Row, joints: int) -> None:
+    """Prepares the first stage of the integrator, at the beginning of the period.
+
+    Args:
+        s: Row of the site.
+        joints: Number of joints.
+    """
+    for i in range(joints):
+        s.stage_q[i] = s.q[i]
+        s.stage_qd[i] = s.qd[i]
+        s.sum_qd[i] = 0.0
+        s.sum_qdd[i] = 0.0
+
+
+@leaf
+def end_stages(h_s: float, s: Row, joints: int) -> bool:
+    """Writes the positions and velocities at the end of the period, if they are finite.
+
+    Args:
+        h_s: The period, s.
+        s: Row of the site, after all stages.
+        joints: Number of joints.
+
+    Returns:
+        True if the result is finite. Otherwise positions and velocities are unchanged.
+    """
+    sixth = h_s / 6.0
+    are_finite = True
+    for i in range(joints):
+        q = s.q[i] + sixth * s.sum_qd[i]
+        qd = s.qd[i] + sixth * s.sum_qdd[i]
+        s.stage_q[i] = q
+        s.stage_qd[i] = qd
+        are_finite = are_finite and isfinite(q) and isfinite(qd)
+
+    if are_finite:
+        for i in range(joints):
+            s.q[i] = s.stage_q[i]
+            s.qd[i] = s.stage_qd[i]
+    return are_finite
 
 
 @leaf
@@ -385,32 +456,14 @@ def advance_arm(
         unchanged.
     """
     n = chain.shape[0]
-    for i in range(n):
-        s.stage_q[i] = s.q[i]
-        s.stage_qd[i] = s.qd[i]
-        s.sum_qd[i] = 0.0
-        s.sum_qdd[i] = 0.0
+    begin_stages(s, n)
     half = 0.5 * h_s
     _put_acceleration(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
-    _use_stage(s, n, 1.0, half)
+    use_stage(s, n, 1.0, half)
     _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)
-    _use_stage(s, n, 2.0, half)
+    use_stage(s, n, 2.0, half)
     _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)
-    _use_stage(s, n, 2.0, h_s)
+    use_stage(s, n, 2.0, h_s)
     _put_acceleration(t_s=t_s + h_s, s=s, chain=chain, actors=actors, table=table)
-    _use_stage(s, n, 1.0, 0.0)
-
-    sixth = h_s / 6.0
-    are_finite = True
-    for i in range(n):
-        q = s.q[i] + sixth * s.sum_qd[i]
-        qd = s.qd[i] + sixth * s.sum_qdd[i]
-        s.stage_q[i] = q
-        s.stage_qd[i] = qd
-        are_finite = are_finite and isfinite(q) and isfinite(qd)
-
-    if are_finite:
-        for i in range(n):
-            s.q[i] = s.stage_q[i]
-            s.qd[i] = s.stage_qd[i]
-    return are_finite
+    use_stage(s, n, 1.0, 0.0)
+    return end_stages(h_s, s, n)

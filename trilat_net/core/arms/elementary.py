@@ -15,9 +15,8 @@ Invariant:
 
 import math
 
-import numpy as np
-
 from ..step.jit import leaf
+from ..step.vectors import choose, round_down, whole
 
 _QUARTERS_PER_RAD = 2.0 / math.pi
 # pi/2 in three parts: products of the first two with small integers are exact.
@@ -36,9 +35,9 @@ def sincos(x: float) -> tuple[float, float]:
     itself causes an error of similar size. Both results are NaN if the angle is not finite or
     is beyond `LARGEST_RAD`.
     """
-    # NumPy's `floor` returns a float: the angle y need not wait for conversions to an integer
-    # and back.
-    quarter = float(np.floor(x * _QUARTERS_PER_RAD + 0.5))
+    # `round_down` returns a float: the angle y need not wait for conversions to an integer and
+    # back.
+    quarter = round_down(x * _QUARTERS_PER_RAD + 0.5)
     y = ((x - quarter * _PART_1) - quarter * _PART_2) - quarter * _PART_3
     z = y * y
     # Horner's scheme for sin(y) and cos(y), with y from -pi/4 to pi/4.
@@ -59,13 +58,13 @@ def sincos(x: float) -> tuple[float, float]:
     # After n quarter turns: (s, c), (c, -s), (-s, -c) or (-c, s) for n modulo 4. Selections in
     # place of branches let a loop over several angles use vector instructions.
     is_in_range = abs(x) <= LARGEST_RAD
-    turn = int(quarter if is_in_range else 0.0)
+    turn = whole(choose(is_in_range, quarter, 0.0))
     is_odd = turn & 1 != 0
-    sine = c if is_odd else s
-    cosine = s if is_odd else c
-    sine = -sine if turn & 2 != 0 else sine
-    cosine = -cosine if (turn + 1) & 2 != 0 else cosine
-    return (sine if is_in_range else math.nan), (cosine if is_in_range else math.nan)
+    sine = choose(is_odd, c, s)
+    cosine = choose(is_odd, s, c)
+    sine = choose(turn & 2 != 0, -sine, sine)
+    cosine = choose((turn + 1) & 2 != 0, -cosine, cosine)
+    return choose(is_in_range, sine, math.nan), choose(is_in_range, cosine, math.nan)
 
 
 _LOG_2_HIGH = 6.93145751953125e-1

@@ -255,7 +255,7 @@ def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
 
 
 @leaf
-def _acceleration(
+def find_stage_acceleration(
     t_s: float,
     q: Pair,
     qd: Pair,
@@ -286,6 +286,93 @@ def _acceleration(
     )
     torque = (on_arm[0] + u[0], on_arm[1] + u[1])
     return forward_dynamics(theta=theta, g=g, q=q, qd=qd, torque=torque)
+
+
+@leaf
+def advance_stage(
+    t_s: float,
+    ahead_s: float,
+    q: Vector,
+    qd: Vector,
+    qd_before: Vector,
+    qdd_before: Vector,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> tuple[Pair, Pair]:
+    """Evaluates stages 2 to 4 of the Runge-Kutta method, from the results of the stage before.
+
+    Args:
+        t_s: Time at the beginning of the period, s since the epoch.
+        ahead_s: Time of the stage after the beginning of the period, s.
+        q: Joint angles at the beginning of the period, rad.
+        qd: Joint velocities at the beginning of the period, rad/s.
+        qd_before: Joint velocities at the stage before, rad/s.
+        qdd_before: Joint accelerations at the stage before, rad/s^2.
+        u: Held torque, shape (2,), N m.
+        theta: Parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        lengths: Lengths of the two links, m.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+
+    Returns:
+        Joint velocities and joint accelerations at the stage.
+    """
+    stage_q = add_scaled(q, ahead_s, qd_before)
+    stage_qd = add_scaled(qd, ahead_s, qdd_before)
+    stage_qdd = find_stage_acceleration(
+        t_s=t_s + ahead_s,
+        q=stage_q,
+        qd=stage_qd,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        actors=actors,
+        table=table,
+    )
+    return stage_qd, stage_qdd
+
+
+@leaf
+def combine_stages(
+    h_s: float,
+    q: Vector,
+    qd: Vector,
+    qd_2: Vector,
+    qd_3: Vector,
+    qd_4: Vector,
+    qdd_1: Vector,
+    qdd_2: Vector,
+    qdd_3: Vector,
+    qdd_4: Vector,
+) -> tuple[Pair, Pair]:
+    """Returns the joint angles and velocities at the end of a period, from all four stages.
+
+    Args:
+        h_s: The period, s.
+        q: Joint angles at the beginning, rad.
+        qd: Joint velocities at the beginning, which are those of stage 1, rad/s.
+        qd_2: Joint velocities at stage 2, rad/s.
+        qd_3: Joint velocities at stage 3, rad/s.
+        qd_4: Joint velocities at stage 4, rad/s.
+        qdd_1: Joint accelerations at stage 1, rad/s^2.
+        qdd_2: Joint accelerations at stage 2, rad/s^2.
+        qdd_3: Joint accelerations at stage 3, rad/s^2.
+        qdd_4: Joint accelerations at stage 4, rad/s^2.
+    """
+    sixth = h_s / 6.0
+    v_sum_0 = qd[0] + 2.0 * qd_2[0] + 2.0 * qd_3[0] + qd_4[0]
+    v_sum_1 = qd[1] + 2.0 * qd_2[1] + 2.0 * qd_3[1] + qd_4[1]
+    a_sum_0 = qdd_1[0] + 2.0 * qdd_2[0] + 2.0 * qdd_3[0] + qdd_4[0]
+    a_sum_1 = qdd_1[1] + 2.0 * qdd_2[1] + 2.0 * qdd_3[1] + qdd_4[1]
+    q_next = add_scaled(q, sixth, (v_sum_0, v_sum_1))
+    qd_next = add_scaled(qd, sixth, (a_sum_0, a_sum_1))
+    return q_next, qd_next
 
 
 @leaf
@@ -323,18 +410,18 @@ def rk4_step(
         Joint angles and joint velocities at the end of the period.
     """
     half = 0.5 * h_s
-    sixth = h_s / 6.0
     q1 = (q[0], q[1])
     v1 = (qd[0], qd[1])
-    a1 = _acceleration(
+    a1 = find_stage_acceleration(
         t_s=t_s, q=q1, qd=v1, u=u, theta=theta, g=g, lengths=lengths, actors=actors, table=table
     )
-    q2 = add_scaled(q1, half, v1)
-    v2 = add_scaled(v1, half, a1)
-    a2 = _acceleration(
-        t_s=t_s + half,
-        q=q2,
-        qd=v2,
+    v2, a2 = advance_stage(
+        t_s=t_s,
+        ahead_s=half,
+        q=q1,
+        qd=v1,
+        qd_before=v1,
+        qdd_before=a1,
         u=u,
         theta=theta,
         g=g,
@@ -342,12 +429,13 @@ def rk4_step(
         actors=actors,
         table=table,
     )
-    q3 = add_scaled(q1, half, v2)
-    v3 = add_scaled(v1, half, a2)
-    a3 = _acceleration(
-        t_s=t_s + half,
-        q=q3,
-        qd=v3,
+    v3, a3 = advance_stage(
+        t_s=t_s,
+        ahead_s=half,
+        q=q1,
+        qd=v1,
+        qd_before=v2,
+        qdd_before=a2,
         u=u,
         theta=theta,
         g=g,
@@ -355,12 +443,13 @@ def rk4_step(
         actors=actors,
         table=table,
     )
-    q4 = add_scaled(q1, h_s, v3)
-    v4 = add_scaled(v1, h_s, a3)
-    a4 = _acceleration(
-        t_s=t_s + h_s,
-        q=q4,
-        qd=v4,
+    v4, a4 = advance_stage(
+        t_s=t_s,
+        ahead_s=h_s,
+        q=q1,
+        qd=v1,
+        qd_before=v3,
+        qdd_before=a3,
         u=u,
         theta=theta,
         g=g,
@@ -368,13 +457,33 @@ def rk4_step(
         actors=actors,
         table=table,
     )
-    v_sum_0 = v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0]
-    v_sum_1 = v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1]
-    a_sum_0 = a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0]
-    a_sum_1 = a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1]
-    q_next = add_scaled(q1, sixth, (v_sum_0, v_sum_1))
-    qd_next = add_scaled(v1, sixth, (a_sum_0, a_sum_1))
-    return q_next, qd_next
+    return combine_stages(
+        h_s=h_s,
+        q=q1,
+        qd=v1,
+        qd_2=v2,
+        qd_3=v3,
+        qd_4=v4,
+        qdd_1=a1,
+        qdd_2=a2,
+        qdd_3=a3,
+        qdd_4=a4,
+    )
+
+
+@leaf
+def move_arm(s: Row, q: Pair, qd: Pair) -> bool:
+    """Writes joint angles and velocities into the row of a site, if they are finite.
+
+    Returns:
+        False if they are not finite. Then the row is unchanged.
+    """
+    is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
+    if not is_finite:
+        return False
+    put_pair(s.q, q)
+    put_pair(s.qd, qd)
+    return True
 
 
 @leaf
@@ -408,9 +517,4 @@ def advance_arm(
         actors=actors,
         table=table,
     )
-    is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
-    if not is_finite:
-        return False
-    put_pair(s.q, q)
-    put_pair(s.qd, qd)
-    return True
+    return move_arm(s, q, qd)

@@ -51,7 +51,13 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
 
 @leaf
-def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
+def loses_samples(model: Row) -> bool:
+    """Returns True if a model may lose samples at random, so that its losses are drawn."""
+    return bool(model.loss_good != 0.0 or model.enter != 0.0)
+
+
+@leaf
+def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -> bool:
     """Advances the chain of losses by one sample, and returns True if the sample is lost.
 
     The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
@@ -59,14 +65,12 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
     probability enter / (enter + leave).
 
     Args:
-        sample: Index of the sample.
+        u: Uniform random number, which decides on the state of the chain.
+        v: Uniform random number, which decides on the loss.
         fresh: True for the first sample of the model.
         link: Row of the link, whose state is changed.
-        model: Model in force.
+        model: Model in force, which loses samples.
     """
-    if model.loss_good == 0.0 and model.enter == 0.0:
-        return False
-    u, v = uniforms(link.key, sample, LOSS, 0)
     if fresh:
         # A product and not a quotient: enter + leave may be zero.
         link.bad = u * (model.enter + model.leave) < model.enter
@@ -79,7 +83,23 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 
 
 @leaf
-def _delay_us(
+def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
+    """Draws whether a sample is lost, and returns True if it is.
+
+    Args:
+        sample: Index of the sample.
+        fresh: True for the first sample of the model.
+        link: Row of the link, whose state is changed.
+        model: Model in force.
+    """
+    if not loses_samples(model):
+        return False
+    u, v = uniforms(link.key, sample, LOSS, 0)
+    return advance_losses(u, v, fresh, link, model)
+
+
+@leaf
+def find_delay_us(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
     """Returns the delay of a sample, us, or LOST if a trace says that the sample is lost.
@@ -114,21 +134,43 @@ def _delay_us(
 
 
 @leaf
-def _due_ns(
-    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
-) -> int:
-    """Computes when a link delivers a sample, or that the link loses it.
-
-    This function must be called once for each sample, in the order of the indices. The models
-    of bursts of loss and of correlated delays have a state, which it advances. Therefore loss
-    and delay are drawn even for a sample that is lost for another reason.
+def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int:
+    """Returns the due time of a sample that is not lost, from its delay, ns since the epoch.
 
     Args:
-        sample: Index of the sample, the state that the sender sent in the tick (period of its
-            control loop) of this number.
-        stamp_ns: Time at which the sample was sent, ns since the epoch, the common start of the
-            session.
-        fresh: True for the first sample of the model, with which the model's state starts.
+        stamp_ns: Time at which the sample was sent, ns since the epoch.
+        delay_us: Delay of the sample, or the smaller one of its delay and that of its copy, us.
+        link: State of the link, whose latest due time `due_before` is updated.
+        model: Model of delay and loss in force.
+    """
+    # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
+    due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
+    if model.in_order == 1:
+        # A sample waits for all older samples.
+        due_ns = max(due_ns, link.due_before)
+    link.due_before = max(due_ns, link.due_before)
+    return due_ns
+
+
+@leaf
+def find_due_ns(
+    sample: int,
+    stamp_ns: int,
+    lost: bool,
+    delay_us: int,
+    link: LinkRow,
+    model: Row,
+    points: Points,
+) -> int:
+    """Computes when a link delivers a sample whose loss and delay have been drawn.
+
+    This function must be called once for each sample, in the order of the indices.
+
+    Args:
+        sample: Index of the sample.
+        stamp_ns: Time at which the sample was sent, ns since the epoch.
+        lost: True if the chain of losses lost the sample.
+        delay_us: Delay of the sample, us, or LOST if a trace says that the sample is lost.
         link: State of the link, with the seed `key` of its random numbers; changed. `copies`
             counts the duplicated samples, and `due_before` is the latest due time so far, ns.
         model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
@@ -138,10 +180,6 @@ def _due_ns(
         The due time, at which the link delivers the sample, ns since the epoch. LOST if the
         link loses the sample.
     """
-    lost = _draw_loss(sample, fresh, link, model)
-    delay_us = _delay_us(
-        sample=sample, stamp_ns=stamp_ns, fresh=fresh, link=link, model=model, points=points
-    )
     lost_by_trace = delay_us < 0
     if lost or lost_by_trace or _in_outage(stamp_ns, link, points):
         return LOST
@@ -159,13 +197,65 @@ def _due_ns(
                 copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
                 delay_us = min(delay_us, copy_us)
 
-    # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
-    due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
-    if model.in_order == 1:
-        # A sample waits for all older samples.
-        due_ns = max(due_ns, link.due_before)
-    link.due_before = max(due_ns, link.due_before)
-    return due_ns
+    return delay_sample(stamp_ns, delay_us, link, model)
+
+
+@leaf
+def _due_ns(
+    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
+) -> int:
+    """Computes when a link delivers a sample, or that the link loses it.
+
+    This function must be called once for each sample, in the order of the indices. The models
+    of bursts of loss and of correlated delays have a state, which it advances. Therefore loss
+    and delay are drawn even for a sample that is lost for another reason.
+
+    Args:
+        sample: Index of the sample, the state that the sender sent in the tick (period of its
+            control loop) of this number.
+        stamp_ns: Time at which the sample was sent, ns since the epoch, the common start of the
+            session.
+        fresh: True for the first sample of the model, with which the model's state starts.
+        link: State of the link; changed, see `find_due_ns`.
+        model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
+        points: Delay traces and outages of all links of the receiver.
+
+    Returns:
+        The due time, see `find_due_ns`.
+    """
+    lost = _draw_loss(sample, fresh, link, model)
+    delay_us = find_delay_us(
+        sample=sample, stamp_ns=stamp_ns, fresh=fresh, link=link, model=model, points=points
+    )
+    return find_due_ns(
+        sample=sample,
+        stamp_ns=stamp_ns,
+        lost=lost,
+        delay_us=delay_us,
+        link=link,
+        model=model,
+        points=points,
+    )
+
+
+@leaf
+def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) -> bool:
+    """Selects the model that is in force when a sample is sent, the model of the link.
+
+    Args:
+        sample: Index of the sample.
+        stamp_ns: Time at which the sample was sent, ns since the epoch.
+        link: Row of the link, whose field `model` is the index of the model; changed.
+        models: Models of the link, in the order in which they come into force.
+
+    Returns:
+        True if the sample is the first one of the model.
+    """
+    fresh = sample == 0
+    while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
+        link.model += 1
+        fresh = True
+    return fresh
 
 
 @leaf
@@ -190,11 +280,8 @@ def schedule_deliveries(
     kept = dues.shape[0]
     while link.scheduled < sample:
         m = link.scheduled + 1
-        fresh = m == 0
         stamp_ns = tick_ns(m, link.rate_hz)
-        while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
-            link.model += 1
-            fresh = True
+        fresh = select_model(m, stamp_ns, link, models)
         dues[m % kept] = _due_ns(
             sample=m,
             stamp_ns=stamp_ns,

@@ -47,7 +47,8 @@ from .user_law import (
     list_remembered,
 )
 
-_CHECKED: Any = {"_nrt": False, "boundscheck": True}
+CHECKED: Any = {"_nrt": False, "boundscheck": True}
+"""Options with which laws are compiled: wrong indices and divisions by zero raise."""
 T = TypeVar("T")
 
 
@@ -68,7 +69,7 @@ def compiled(law: T) -> T:
     if not isinstance(law, type):
         # called from a law in plain Python it stays a Python function, which takes any objects
         function: Any = law
-        callable_from_python: T = register_jitable(**_CHECKED)(function)
+        callable_from_python: T = register_jitable(**CHECKED)(function)
         return callable_from_python
     law.is_compiled = True  # type: ignore[attr-defined]
     return cast(T, law)
@@ -90,6 +91,29 @@ def _all_finite(values: Array) -> bool:
     for i in range(values.shape[0]):
         are_finite = are_finite and np.isfinite(values[i])
     return are_finite
+
+
+@leaf
+def finish_law(s: Row, law: Array, sent: Array) -> None:
+    """Checks the results of a law, and limits its torque.
+
+    Args:
+        s: Row of the site, with the torque and the estimate; the torque is limited.
+        law: Numbers of the law, those that it keeps from tick to tick first.
+        sent: Vectors that the law sends.
+
+    Raises:
+        FloatingPointError: A result is not finite.
+    """
+    is_torque_finite = _all_finite(s.tau[: s.joints])
+    is_estimate_finite = _all_finite(s.theta_hat)
+    is_sent_finite = _all_finite(sent)
+    if not (is_torque_finite and is_estimate_finite and is_sent_finite):
+        raise FloatingPointError
+    if not _all_finite(law[: s.remembered]):
+        raise FloatingPointError
+    for i in range(s.joints):
+        s.tau[i] = limit_torque(s.tau[i], s.tau_limit[i])
 
 
 @leaf
@@ -127,19 +151,11 @@ def law_stage(
     s: Row = site[0]
     s.asked = 1
     call_address(address, (law, site, links, channel.received, sent))
-    is_torque_finite = _all_finite(s.tau[: s.joints])
-    is_estimate_finite = _all_finite(s.theta_hat)
-    is_sent_finite = _all_finite(sent)
-    if not (is_torque_finite and is_estimate_finite and is_sent_finite):
-        raise FloatingPointError
-    if not _all_finite(law[: s.remembered]):
-        raise FloatingPointError
-    for i in range(s.joints):
-        s.tau[i] = limit_torque(s.tau[i], s.tau_limit[i])
+    finish_law(s, law, sent)
     s.asked = 0
 
 
-class _Form(NamedTuple):
+class LawForm(NamedTuple):
     """Layouts for which a law is compiled. Laws with equal forms share the compiled code.
 
     Attributes:
@@ -180,8 +196,46 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
     return np.dtype((np.record, layout))
 
 
+# Numba cannot return a record from a function, so the code becomes a part of each caller.
+@numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
+def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
+    """Returns the input of a control law in a tick. Nothing is copied.
+
+    Args:
+        s: Row of the site.
+        links: Rows of the links from the peers.
+        received: Vectors that came from each peer.
+        sent: Vectors that go to each peer alone.
+        to_all: Vectors that go to all peers.
+    """
+    return LawInput(
+        k=s.k,
+        t_s=s.t_s,
+        h_s=s.h_s,
+        q=s.q,
+        qd=s.qd,
+        q_des=s.q_des,
+        qd_des=s.qd_des,
+        felt=s.felt,
+        joints=s.joints,
+        coordinates=s.shared,
+        tau=s.tau,
+        peers=links,
+        received=received,
+        sent=sent,
+        to_all=to_all,
+        tau_x=s.tau_x,
+        tau_before=s.tau_before,
+        q_before=s.q_before,
+        gravity=s.G,
+        theta_hat=s.theta_hat,
+        inertia=s.M,
+        bias=s.bias,
+    )
+
+
 @cache
-def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
+def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
     """Returns the compiled form of a law's `torque`.
 
     Its arguments are the law's numbers, the site's row, its links' rows, and the arrays of the
@@ -204,7 +258,7 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     to_all_size = 0 if to_all_dtype is None else to_all_dtype.itemsize // 8
     peer_size = 0 if sent_dtype is None else sent_dtype.itemsize // 8
     sent_end = to_all_size + form.peers * peer_size
-    compute = numba.njit(**_CHECKED)(torque)
+    compute = numba.njit(**CHECKED)(torque)
 
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
         """Collects the input of the control law, and calls the law's method `torque`.
@@ -227,30 +281,7 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
         from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
         to_peers = () if sent_dtype is None else sent[to_all_size:sent_end].view(sent_dtype)
         to_all = None if to_all_dtype is None else sent[:to_all_size].view(to_all_dtype)[0]
-        now = LawInput(
-            k=s.k,
-            t_s=s.t_s,
-            h_s=s.h_s,
-            q=s.q,
-            qd=s.qd,
-            q_des=s.q_des,
-            qd_des=s.qd_des,
-            felt=s.felt,
-            joints=s.joints,
-            coordinates=s.shared,
-            tau=s.tau,
-            peers=links,
-            received=from_peers,
-            sent=to_peers,
-            to_all=to_all,
-            tau_x=s.tau_x,
-            tau_before=s.tau_before,
-            q_before=s.q_before,
-            gravity=s.G,
-            theta_hat=s.theta_hat,
-            inertia=s.M,
-            bias=s.bias,
-        )
+        now = collect_law_input(s, links, from_peers, to_peers, to_all)
         # `compute` is the compiled method, whose `self` is the record of the law's numbers.
         compute(law[:law_size].view(law_dtype)[0], now)
 
@@ -263,8 +294,8 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     if sources:
         text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
         digest = hashlib.sha256(text.encode()).hexdigest()
-        return compile_named(call, f"law_{digest[:32]}", signature, **_CHECKED)
-    function = numba.njit(signature, **_CHECKED)(call)
+        return compile_named(call, f"law_{digest[:32]}", signature, **CHECKED)
+    function = numba.njit(signature, **CHECKED)(call)
     if any(known.return_type != types.none for known in compute.nopython_signatures):
         raise NumbaError(
             "torque returns a value, but a compiled law must write the torque to now.tau "
@@ -436,6 +467,8 @@ class CompiledLaw:
     Attributes:
         row: Numbers of the law, those that it keeps from tick to tick first.
         address: Address of its machine code.
+        form: Layouts of the arrays of the law.
+        torque: Method of the law's class that computes the torque, not compiled.
 
     Raises:
         ScenarioError: Numba cannot compile the law.
@@ -456,7 +489,8 @@ class CompiledLaw:
         channel = arrays.channel
         received_size = 0 if channel is None else channel.received.shape[-1]
         fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
-        form = _Form(
+        self.torque: Callable[..., Any] = type(law).torque
+        self.form = form = LawForm(
             law=np.dtype((np.record, fields or [("nothing", "f8")])),
             site=arrays.site.dtype,
             link=arrays.links.dtype,
@@ -466,7 +500,7 @@ class CompiledLaw:
             peers=len(setup.links),
         )
         try:
-            self._function = _compile_law(type(law).torque, form)
+            self._function = _compile_law(self.torque, form)
         except (NumbaError, KeyError) as error:
             raise ScenarioError(
                 f"{law_name(law)} cannot be compiled: {_explain(error, law)}", path=path

@@ -88,7 +88,7 @@ def max_over_joints(buckets: Array) -> Array:
 
 
 @leaf
-def _first_sent(s: SiteRow) -> int:
+def first_sent_column(s: SiteRow) -> int:
     """Returns the first column of the numbers that a law sends in its site's row of floats."""
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
@@ -148,7 +148,7 @@ def _accept_record(
     """
     n = peer.joints
     m = peer.shared
-    first_sent = _first_sent(peer)
+    first_sent = first_sent_column(peer)
     q_column = 0
     qd_column = n
     tau_x_column = 3 * n + 2 * m
@@ -271,7 +271,7 @@ def update_peaks(
     """
     largest_error = 0.0
     joints = peaks.shape[0] // 3
-    pose = _first_sent(s) - 3 * s.shared if s.task else 0
+    pose = first_sent_column(s) - 3 * s.shared if s.task else 0
     reference = 2 * s.joints
     # A task may have fewer coordinates than the arm has joints, or more: the rest are zeros.
     for i in range(joints):
@@ -513,7 +513,7 @@ def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None
         laws: The users' compiled laws, or None.
     """
     if laws is not None:
-        first = _first_sent(s)
+        first = first_sent_column(s)
         for c in range(s.sent):
             row[first + c] = laws.sent[i, c]
 

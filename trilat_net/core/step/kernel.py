@@ -98,7 +98,7 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
 
 
 @leaf
-def _adapts(s: SiteRow) -> bool:
+def adapts(s: SiteRow) -> bool:
     """Returns True if the estimate adapts in the present mode.
 
     It does not adapt in DIVERGED, and at rest only while the law's own torque is in use.
@@ -125,14 +125,23 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
             overwritten with the sum of both; stage 8 sets it anew.
         chain: Rows of the chain, or None.
     """
-    # `_adapts` is evaluated last, because it is the costly condition.
-    if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
-        return
+    # `adapts` is evaluated last, because it is the costly condition.
+    if updates_estimate(k, s) and adapts(s):
+        sum_trapezoid(s)
+        _advance_estimate(s, chain, 0.5 / s.rate_hz, s.Yr_before)
+
+
+@leaf
+def updates_estimate(k: int, s: SiteRow) -> bool:
+    """Returns True if stage 5 updates the estimate of the law in a tick, if it adapts."""
+    return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
+
+
+@leaf
+def sum_trapezoid(s: SiteRow) -> None:
+    """Writes the sum Y' r of both ticks into `Yr_before`, see `_update_estimate`."""
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
-    sum_of_both_ticks = s.Yr_before
-    half_h_s = 0.5 / s.rate_hz
-    _advance_estimate(s, chain, half_h_s, sum_of_both_ticks)
 
 
 @leaf
@@ -303,6 +312,50 @@ def _advance_arm(
 
 
 @leaf
+def hold_motor_torque(k: int, s: SiteRow) -> None:
+    """Begins stage 8: computes the torque that is held over the period.
+
+    It is the torque of the middle of the period, extrapolated linearly:
+
+        u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
+
+    At the first tick, and under DIGITAL, u = tau_k.
+
+    Args:
+        k: The tick.
+        s: Row of the site; `u` and `q_before` are written.
+    """
+    for i in range(s.q.shape[0]):
+        s.q_before[i] = s.q[i]
+    if s.external != 0:
+        return
+    for i in range(s.u.shape[0]):
+        torque = s.tau[i]
+        if s.scheme != _DIGITAL and k > s.first:
+            extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
+            torque = control.limit_torque(extrapolated, s.tau_limit[i])
+        s.u[i] = torque + s.held[i]
+
+
+@leaf
+def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
+    """Ends stage 8: keeps numbers of this tick for the next one.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        is_adapting: What `adapts` returned before the arm moved.
+    """
+    h_s = 1.0 / s.rate_hz
+    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
+        _advance_estimate(s, chain, h_s, s.Yr)
+    for i in range(s.tau.shape[0]):
+        s.tau_before[i] = s.tau[i]
+    for p in range(s.Yr.shape[0]):
+        s.Yr_before[p] = s.Yr[p] if is_adapting and s.mode != _DIVERGED else 0.0
+
+
+@leaf
 def _advance(
     k: int,
     t_ns: int,
@@ -312,12 +365,6 @@ def _advance(
     table: TorqueTable,
 ) -> None:
     """Runs stage 8: advances the state from t_k to t_{k+1}, and keeps numbers for tick k+1.
-
-    The torque that is held over the period is that of its middle, extrapolated linearly:
-
-        u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
-
-    At the first tick, and under DIGITAL, u = tau_k.
 
     Args:
         k: The tick.
@@ -329,27 +376,15 @@ def _advance(
     """
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
-    adapts = _adapts(s)
-    for i in range(s.q.shape[0]):
-        s.q_before[i] = s.q[i]
+    is_adapting = adapts(s)
+    hold_motor_torque(k, s)
     if s.external == 0:
-        for i in range(s.u.shape[0]):
-            torque = s.tau[i]
-            if s.scheme != _DIGITAL and k > s.first:
-                extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
-                torque = control.limit_torque(extrapolated, s.tau_limit[i])
-            s.u[i] = torque + s.held[i]
         is_finite = _advance_arm(
             t_s=t_ns * 1e-9, h_s=h_s, s=s, chain=chain, actors=actors, table=table
         )
         if not is_finite:
             s.mode = _DIVERGED
-    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and adapts and s.mode != _DIVERGED:
-        _advance_estimate(s, chain, h_s, s.Yr)
-    for i in range(s.tau.shape[0]):
-        s.tau_before[i] = s.tau[i]
-    for p in range(s.Yr.shape[0]):
-        s.Yr_before[p] = s.Yr[p] if adapts and s.mode != _DIVERGED else 0.0
+    finish_advance(s, chain, is_adapting)
 
 
 @leaf
@@ -444,6 +479,24 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 
 @leaf
+def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
+    """Ends stage 3: stops the reference while peers are silent, and limits its speed.
+
+    Args:
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        s: State of the site, with the reference; changed.
+        links: States of the links from the other sites.
+    """
+    if s.on_stale == _GLIDE:
+        update_session_life(t_ns, s, links)
+    else:
+        update_stale_mode(t_ns, s, links)
+    if not rests(s):
+        limit_reference(k, s)
+
+
+@leaf
 def reference_stages(
     k: int,
     t_ns: int,
@@ -474,12 +527,7 @@ def reference_stages(
     # 3 reference
     update_reference(t_ns, s, links, ramps)
     _place_arm(s, chain, links, True)
-    if s.on_stale == _GLIDE:
-        update_session_life(t_ns, s, links)
-    else:
-        update_stale_mode(t_ns, s, links)
-    if not rests(s):
-        limit_reference(k, s)
+    guard_reference(k, t_ns, s, links)
     # 4 errors
     _update_errors(s, chain)
     # 5 estimate
@@ -537,6 +585,29 @@ def sense_stages(
 
 
 @leaf
+def emit_stages(k: int, t_ns: int, s: SiteRow, chain: RowArray | None, record: Array) -> None:
+    """Limits the torque of the law, and writes the record (stages 6 and 7).
+
+    If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the rule
+    `glide` the arm comes to rest instead, see `session_life`.
+
+    Args:
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        s: State of the site (the process that runs the arm), with the torque of the law;
+            written.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        record: Receives the floating-point numbers of the record, the results of the tick.
+    """
+    _guard_torque(k, t_ns, s, chain)
+    for i in range(s.joints):
+        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
+            s.mode = _DIVERGED
+    # 7 emit
+    _write_record(s, record)
+
+
+@leaf
 def act_stages(
     k: int,
     t_ns: int,
@@ -549,8 +620,7 @@ def act_stages(
     """Computes the part of a control period that follows the control law.
 
     The torque is limited, the record is written, and the arm moves to the next period (stages 6
-    to 8). If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the
-    rule `glide` the arm comes to rest instead, see `session_life`.
+    to 8). See `emit_stages` for a joint that is faster than its limit.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -563,12 +633,7 @@ def act_stages(
         record: Receives the floating-point numbers of the record, the results of the tick.
     """
     s: SiteRow = site[0]
-    _guard_torque(k, t_ns, s, chain)
-    for i in range(s.joints):
-        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
-            s.mode = _DIVERGED
-    # 7 emit
-    _write_record(s, record)
+    emit_stages(k=k, t_ns=t_ns, s=s, chain=chain, record=record)
     # 8 advance
     if s.mode != _DIVERGED:
         _advance(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)

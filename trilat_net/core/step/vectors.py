@@ -71,6 +71,33 @@ def put_five(a: Any, values: Five) -> None:
 
 
 @leaf
+def choose(condition: bool, if_true: float, if_false: float) -> float:
+    """Returns one of two numbers. Both are computed, so that compiled code has no branch.
+
+    Functions with `choose` can also be compiled for numbers of several runs, see
+    `execution/lanes`.
+
+    Args:
+        condition: The condition.
+        if_true: Result if the condition is true.
+        if_false: Result if the condition is false.
+    """
+    return if_true if condition else if_false
+
+
+@leaf
+def round_down(number: float) -> float:
+    """Returns the largest whole number that is not above a number."""
+    return float(np.floor(number))
+
+
+@leaf
+def whole(number: float) -> int:
+    """Returns a number without a fractional part as an integer."""
+    return int(number)
+
+
+@leaf
 def count_started(table: Any, first: int, count: int, now: float) -> int:
     """Returns how many rows of a time table start at a given time or before.
 

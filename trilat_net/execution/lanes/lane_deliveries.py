@@ -9,14 +9,35 @@ Invariant:
       the same tick rate and each sample arrives at the first tick after it was sent.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba.core import types
 
-from ...core.links.channel import LOST, schedule_deliveries
-from ...core.links.delay import DelayKind, clamp_delay_us
-from ...core.links.link import LinkArrays, accept_sample, release_sample
-from ...core.step.jit import leaf
+from ...core.links.channel import (
+    LOST,
+    advance_losses,
+    delay_sample,
+    find_delay_us,
+    find_due_ns,
+    loses_samples,
+    select_model,
+)
+from ...core.links.delay import (
+    DELAY,
+    LINK_MODEL_DTYPE,
+    LOSS,
+    DelayKind,
+    clamp_delay_us,
+    draw_delay_us,
+)
+from ...core.links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
+from ...core.links.philox import DrawKey, uniforms
+from ...core.plug.plugged import call_address
+from ...core.step.fused_run import ReplayedInputs
+from ...core.step.jit import find_lane_address, lane_leaf, leaf
+from ...core.step.kernel import channel_of
 from ...core.step.row_fields import LinkRow
 from ...core.step.site_arrays import SiteArrays
 from ...core.step.ticks import first_tick_at, tick_ns
@@ -25,45 +46,91 @@ from ...core.step.vectors import Array, IntArray, Points, Row, RowArray
 BLOCK_TICKS = 500
 """Number of ticks whose deliveries are computed together."""
 _CONSTANT = int(DelayKind.CONSTANT)
+_UNIFORM = int(DelayKind.UNIFORM)
+
+
+class DelayNumbers(NamedTuple):
+    """Parameters of a delay model without a memory, as `draw_delay_us` reads them.
+
+    In contrast to a row of the table of models, the kind can be known to the compiler, which
+    then removes the branches for other kinds. See `DelayKind` for the meaning of the others.
+    """
+
+    kind: int
+    location: float
+    scale: float
+    extra: float
+    weight: float
 
 
 class LinkStates(NamedTuple):
-    """State of all links of one run, for N sites with P peers each.
+    """State of all links of the runs in L lanes, for N sites with P peers each.
 
     Attributes:
-        links: Rows of the links, shape (N, P), see `LinkRow`.
-        models: Models of delay and loss, shape (N, P, M).
-        dues: Due times of the newest samples, shape (N, P, D), ns.
-        points: Traces and outages.
-        releases: For each tick the newest sample that is released then, or -1, shape (N, P, R),
-            a ring buffer. R is a power of two.
-        newest: Sample in use at the last tick, or -1, shape (N, P).
+        links: Rows of the links, shape (L, N, P), see `LinkRow`.
+        models: Models of delay and loss, shape (L, N, P, M).
+        points: Traces and outages of each run, shape (L, n, 2).
+        releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
+            R), a ring buffer. R is a power of two.
+        newest: Sample in use at the last tick, or -1, shape (L, N, P).
+        uniforms: Room for two random numbers of each sample of a block.
+        delays_us: Room for the delay of each sample of a block, us.
+        stamps_ns: Room for the stamp of each sample of a block, ns.
     """
 
     links: RowArray
     models: RowArray
-    dues: IntArray
     points: Points
     releases: IntArray
     newest: IntArray
+    uniforms: Array
+    delays_us: IntArray
+    stamps_ns: IntArray
 
 
-def copy_link_states(arrays: SiteArrays) -> LinkStates:
-    """Returns the state of the links of a run before its first tick.
+def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
+    """Returns the state of the links of runs before their first tick.
 
     Args:
-        arrays: Arrays of all sites of the run. They are not changed.
+        tables: Arrays of all sites of each run. They are not changed.
     """
-    sites, peers, pages = arrays.calendars.shape
+    sites, peers, _ = tables[0].calendars.shape
+    pages = max(arrays.calendars.shape[2] for arrays in tables)
     # A sample that is sent in a block waits at most as long as the calendar has pages.
     kept = 1 << (pages + BLOCK_TICKS).bit_length()
+    most_models = max(arrays.models.shape[2] for arrays in tables)
+    most_points = max(len(arrays.points) for arrays in tables)
+    models = np.zeros((len(tables), sites, peers, most_models), LINK_MODEL_DTYPE)
+    points = np.zeros((len(tables), most_points, 2), np.int64)
+    for lane, arrays in enumerate(tables):
+        models[lane, :, :, : arrays.models.shape[2]] = arrays.models
+        points[lane, : len(arrays.points)] = arrays.points
     return LinkStates(
-        links=arrays.links.copy(),
-        models=arrays.models.copy(),
-        dues=arrays.dues.copy(),
-        points=arrays.points,
-        releases=np.full((sites, peers, kept), -1),
-        newest=np.full((sites, peers), -1),
+        links=np.stack([arrays.links for arrays in tables]),
+        models=models,
+        points=points,
+        releases=np.full((len(tables), sites, peers, kept), -1),
+        newest=np.full((len(tables), sites, peers), -1),
+        uniforms=np.zeros((2, BLOCK_TICKS)),
+        delays_us=np.zeros(BLOCK_TICKS, np.int64),
+        stamps_ns=np.zeros(BLOCK_TICKS, np.int64),
+    )
+
+
+def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
+    """Returns the state of the links of some lanes.
+
+    Args:
+        states: The state of all lanes.
+        lanes: Indices of the lanes.
+    """
+    chosen = list(lanes)
+    return states._replace(
+        links=states.links[chosen],
+        models=states.models[chosen],
+        points=states.points[chosen],
+        releases=states.releases[chosen],
+        newest=states.newest[chosen],
     )
 
 
@@ -74,8 +141,7 @@ def _is_constant(link: LinkRow, model: Row) -> bool:
         link.models == 1
         and link.outage_count == 0
         and model.kind == _CONSTANT
-        and model.loss_good == 0.0
-        and model.enter == 0.0
+        and not loses_samples(model)
     )
 
 
@@ -100,11 +166,158 @@ def _use_after_constant_delay(
     """
     delay_ns = max(clamp_delay_us(model.location), model.playout_us) * 1000
     wait = first_tick_at(max(delay_ns, 1), rate_hz)
-    newest = -1
     for index in range(count):
-        newest = max(first + index - wait, -1)
-        used[index] = newest
-    return newest
+        used[index] = max(first + index - wait, -1)
+    return int(max(first + count - 1 - wait, -1))
+
+
+@lane_leaf
+def _draw_uniform_delays(
+    first: int, count: int, key: DrawKey, location: float, scale: float, delays_us: IntArray
+) -> None:
+    """Draws uniformly distributed delays of several samples, us.
+
+    Args:
+        first: Index of the first sample.
+        count: Number of samples.
+        key: Key of the link.
+        location: Mean delay, us.
+        scale: Largest deviation from the mean, us.
+        delays_us: Written.
+    """
+    numbers = DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
+    for index in range(count):
+        drawn_us = draw_delay_us(key, first + index, DELAY, numbers)
+        delays_us[index] = clamp_delay_us(drawn_us)
+
+
+@lane_leaf
+def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -> None:
+    """Draws the two random numbers that decide on the loss of each of several samples.
+
+    Args:
+        first: Index of the first sample.
+        count: Number of samples.
+        key: Key of the link.
+        uniform_numbers: Written, shape (2, count).
+    """
+    for index in range(count):
+        u, v = uniforms(key, first + index, LOSS, 0)
+        uniform_numbers[0, index] = u
+        uniform_numbers[1, index] = v
+
+
+class DrawAddresses(NamedTuple):
+    """Addresses of the functions that draw random numbers of several samples at once.
+
+    Their loops use vector instructions, which needs all functions in them to be inlined.
+    """
+
+    delays: int
+    losses: int
+
+
+def find_draw_addresses() -> DrawAddresses:
+    """Compiles the functions that draw random numbers, or loads their code."""
+    integer = types.int64
+    number = types.float64
+    delays = types.Array(integer, 1, "C")
+    uniform_numbers = types.Array(number, 2, "C")
+    delay_types = (integer, integer, types.uint64, number, number, delays)
+    return DrawAddresses(
+        delays=find_lane_address(_draw_uniform_delays, delay_types),
+        losses=find_lane_address(
+            _draw_losses, (integer, integer, types.uint64, uniform_numbers)
+        ),
+    )
+
+
+@leaf
+def _release_samples(
+    first: int,
+    count: int,
+    rate_hz: int,
+    fresh: bool,
+    stamps_ns: IntArray,
+    link: LinkRow,
+    model: Row,
+    points: Points,
+    releases: IntArray,
+    states: LinkStates,
+    draws: DrawAddresses,
+) -> None:
+    """Computes in which ticks samples are released that one model of a link delays.
+
+    The random numbers of all samples are drawn first, in loops that use vector instructions.
+
+    Args:
+        first: Index of the first sample.
+        count: Number of samples.
+        rate_hz: Tick rate of both sites, Hz.
+        fresh: True if the first sample is the first one of the model.
+        stamps_ns: Stamps of the samples, ns since the epoch.
+        link: Row of the link; changed.
+        model: Model of the link.
+        points: Traces and outages.
+        releases: Newest sample that each tick releases, a ring buffer; changed.
+        states: Provides room for the random numbers.
+        draws: Functions that draw them.
+    """
+    mask = releases.shape[0] - 1
+    delays_us = states.delays_us
+    uniform_numbers = states.uniforms
+    if model.kind == _UNIFORM:
+        call_address(
+            draws.delays, (first, count, link.key, model.location, model.scale, delays_us)
+        )
+    else:
+        for index in range(count):
+            delays_us[index] = find_delay_us(
+                sample=first + index,
+                stamp_ns=stamps_ns[index],
+                fresh=fresh and index == 0,
+                link=link,
+                model=model,
+                points=points,
+            )
+    loses = loses_samples(model)
+    if loses:
+        call_address(draws.losses, (first, count, link.key, uniform_numbers))
+    # Neither a copy of a sample nor an outage: the general function is slower.
+    is_plain = model.duplicate == 0.0 and link.outage_count == 0
+    for index in range(count):
+        sample = first + index
+        stamp_ns = stamps_ns[index]
+        lost = False
+        if loses:
+            lost = advance_losses(
+                u=uniform_numbers[0, index],
+                v=uniform_numbers[1, index],
+                fresh=fresh and index == 0,
+                link=link,
+                model=model,
+            )
+        delay_us = delays_us[index]
+        if is_plain:
+            if lost or delay_us < 0:
+                continue
+            due_ns = delay_sample(stamp_ns, delay_us, link, model)
+        else:
+            due_ns = find_due_ns(
+                sample=sample,
+                stamp_ns=stamp_ns,
+                lost=lost,
+                delay_us=delay_us,
+                link=link,
+                model=model,
+                points=points,
+            )
+            if due_ns == LOST:
+                continue
+        # A sample is never used at the time when it was sent.
+        release = first_tick_at(max(due_ns, stamp_ns + 1), rate_hz)
+        # Later samples are newer.
+        releases[release & mask] = sample
 
 
 @leaf
@@ -114,10 +327,11 @@ def _use_samples_of_link(
     rate_hz: int,
     link: LinkRow,
     models: RowArray,
-    dues: IntArray,
     points: Points,
     releases: IntArray,
     newest: int,
+    states: LinkStates,
+    draws: DrawAddresses,
     used: IntArray,
 ) -> int:
     """Finds the samples in use on any link, see `use_samples`.
@@ -128,26 +342,43 @@ def _use_samples_of_link(
         rate_hz: Tick rate of both sites, Hz.
         link: Row of the link; changed.
         models: Models of the link.
-        dues: Due times of its newest samples; changed.
         points: Traces and outages.
         releases: Newest sample that each tick releases, a ring buffer; changed.
         newest: Sample in use before the block, or -1.
+        states: Provides room for random numbers.
+        draws: Functions that draw random numbers.
         used: Written, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
     """
     mask = releases.shape[0] - 1
-    kept = dues.shape[0]
     # Sample k - 1 arrives at tick k.
-    for sample in range(max(first - 1, 0), first + count - 1):
-        schedule_deliveries(sample=sample, link=link, models=models, dues=dues, points=points)
-        due_ns = dues[sample % kept]
-        if due_ns == LOST:
-            continue
-        # A sample is never used at the time when it was sent.
-        release = first_tick_at(max(due_ns, tick_ns(sample, rate_hz) + 1), rate_hz)
-        releases[release & mask] = max(releases[release & mask], sample)
+    first_sample = max(first - 1, 0)
+    sample = first_sample
+    end = first + count - 1
+    while sample < end:
+        fresh = select_model(sample, tick_ns(sample, rate_hz), link, models)
+        model: Row = models[link.model]
+        model_end = end
+        if link.model + 1 < link.models:
+            following_ns = models[link.model + 1].from_ns
+            # The first sample with this stamp or a later one belongs to the next model.
+            model_end = min(end, max(first_tick_at(following_ns, rate_hz), sample + 1))
+        _release_samples(
+            first=sample,
+            count=model_end - sample,
+            rate_hz=rate_hz,
+            fresh=fresh,
+            stamps_ns=states.stamps_ns[sample - first_sample :],
+            link=link,
+            model=model,
+            points=points,
+            releases=releases,
+            states=states,
+            draws=draws,
+        )
+        sample = model_end
     for index in range(count):
         page = (first + index) & mask
         newest = max(newest, releases[page])
@@ -158,42 +389,131 @@ def _use_samples_of_link(
 
 @leaf
 def use_samples(
-    first: int, count: int, rate_hz: int, lane: int, states: LinkStates, used: IntArray
-) -> None:
-    """Finds which sample of each peer every site of a run uses, for a block of ticks.
+    first: int,
+    count: int,
+    rate_hz: int,
+    ended: IntArray,
+    states: LinkStates,
+    draws: DrawAddresses,
+    used: IntArray,
+) -> int:
+    """Finds which sample of each peer every site of several runs uses, for a block of ticks.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
-        lane: Lane of the run.
-        states: State of the links of the run; changed.
-        used: Receives the index of the sample, or -1 before the first one, shape (N, ticks, P,
-            LANES).
+        ended: For each lane the number of ticks of a run that has ended, else -1.
+        states: State of the links of the runs; changed.
+        draws: Functions that draw random numbers.
+        used: Receives the index of the sample, or -1 before the first one, shape (N, P, LANES,
+            ticks).
+
+    Returns:
+        The largest age of a sample in use, ticks. Before the first sample, it is the age that
+        the first sample would have.
     """
+    largest_age = 0
     has_whole_period = 1_000_000_000 % rate_hz == 0
-    for i in range(states.links.shape[0]):
-        for p in range(states.links.shape[1]):
-            link: LinkRow = states.links[i, p]
-            model: Row = states.models[i, p, 0]
-            if has_whole_period and _is_constant(link, model):
-                newest = _use_after_constant_delay(
-                    first, count, rate_hz, model, used[i, :, p, lane]
+    first_sample = max(first - 1, 0)
+    for index in range(count):
+        states.stamps_ns[index] = tick_ns(first_sample + index, rate_hz)
+    for lane in range(states.links.shape[0]):
+        if ended[lane] >= 0:
+            continue
+        for i in range(states.links.shape[1]):
+            for p in range(states.links.shape[2]):
+                link: LinkRow = states.links[lane, i, p]
+                model: Row = states.models[lane, i, p, 0]
+                if has_whole_period and _is_constant(link, model):
+                    newest = _use_after_constant_delay(
+                        first, count, rate_hz, model, used[i, p, lane]
+                    )
+                else:
+                    newest = _use_samples_of_link(
+                        first=first,
+                        count=count,
+                        rate_hz=rate_hz,
+                        link=link,
+                        models=states.models[lane, i, p],
+                        points=states.points[lane],
+                        releases=states.releases[lane, i, p],
+                        newest=states.newest[lane, i, p],
+                        states=states,
+                        draws=draws,
+                        used=used[i, p, lane],
+                    )
+                states.newest[lane, i, p] = newest
+                for index in range(count):
+                    age = first + index - used[i, p, lane, index]
+                    largest_age = max(largest_age, age)
+    return largest_age
+
+
+@leaf
+def use_recorded_samples(
+    first: int,
+    count: int,
+    rate_hz: int,
+    feed: ReplayedInputs,
+    links: RowArray,
+    models: RowArray,
+    dues: IntArray,
+    calendars: RowArray,
+    points: Points,
+    channel: ChannelArrays | None,
+    state: Array,
+    used: IntArray,
+) -> int:
+    """Finds the samples in use in a recorded run, whose arrivals are known, see `use_samples`.
+
+    Args:
+        first: First tick of the block.
+        count: Number of ticks.
+        rate_hz: Tick rate of all sites, Hz.
+        feed: Inputs of the recorded run.
+        links: Rows of the links, shape (N, P); changed.
+        models: Models of the links, shape (N, P, M).
+        dues: Due times, shape (N, P, D); changed.
+        calendars: Calendars of the links, shape (N, P, pages); changed. Their samples have the
+            right index, but no content.
+        points: Traces and outages.
+        channel: Numbers that laws receive, or None; changed.
+        state: Any numbers, at least as many as a site sends.
+        used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks).
+
+    Returns:
+        The largest age of a sample in use, ticks, see `use_samples`.
+    """
+    largest_age = 0
+    for index in range(count):
+        k = first + index
+        for i in range(links.shape[0]):
+            for p in range(links.shape[1]):
+                link = LinkArrays(
+                    state=links[i, p : p + 1],
+                    models=models[i, p],
+                    dues=dues[i, p],
+                    calendar=calendars[i, p],
+                    points=points,
+                    channel=channel_of(channel_of(channel, i), p),
                 )
-            else:
-                newest = _use_samples_of_link(
-                    first=first,
-                    count=count,
-                    rate_hz=rate_hz,
-                    link=link,
-                    models=states.models[i, p],
-                    dues=states.dues[i, p],
-                    points=states.points,
-                    releases=states.releases[i, p],
-                    newest=states.newest[i, p],
-                    used=used[i, :, p, lane],
-                )
-            states.newest[i, p] = newest
+                for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
+                    accept_sample(
+                        k=k,
+                        rate_hz=rate_hz,
+                        tick=feed.samples[n],
+                        q=state,
+                        qd=state,
+                        tau_x=state,
+                        sent=state,
+                        link=link,
+                    )
+                release_sample(k, rate_hz, link)
+                sample = links[i, p].used
+                used[i, p, 0, index] = sample
+                largest_age = max(largest_age, k - sample)
+    return largest_age
 
 
 @leaf
@@ -206,6 +526,8 @@ def repeat_deliveries(
     dues: IntArray,
     calendars: RowArray,
     points: Points,
+    channel: ChannelArrays | None,
+    joints: int,
     states: Array,
 ) -> None:
     """Executes the links of a run for some ticks, without the arms.
@@ -222,12 +544,12 @@ def repeat_deliveries(
         dues: Due times, shape (N, P, D); changed.
         calendars: Calendars of the links, shape (N, P, pages); changed.
         points: Traces and outages.
-        states: The latest states of the sites, q, qd and tau_x, shape (N, R + 1, 6). The state
-            of tick k is at k modulo R. R is a power of two.
+        channel: Numbers that laws receive, or None.
+        joints: Number of joints.
+        states: The latest states of the sites, q, qd, tau_x and the numbers that the law sent,
+            shape (N, R + 1, width). The state of tick k is at k modulo R. R is a power of two.
     """
     mask = states.shape[1] - 2
-    nothing = states[0, 0, :0]
-    joints = states.shape[2] // 3
     for k in range(first, end):
         for i in range(links.shape[0]):
             for p in range(links.shape[1]):
@@ -237,7 +559,7 @@ def repeat_deliveries(
                     dues=dues[i, p],
                     calendar=calendars[i, p],
                     points=points,
-                    channel=None,
+                    channel=channel_of(channel_of(channel, i), p),
                 )
                 if k > 0:
                     peer = p if p < i else p + 1
@@ -249,7 +571,7 @@ def repeat_deliveries(
                         q=state,
                         qd=state[joints:],
                         tau_x=state[2 * joints :],
-                        sent=nothing,
+                        sent=state[3 * joints :],
                         link=link,
                     )
                 release_sample(k, rate_hz, link)

@@ -35,9 +35,9 @@ from numba.core.typing.templates import (
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-LANES = 16
-"""Number of lanes: room for as many runs. A vector register holds at most eight numbers; with
-two registers per quantity, the processor computes one while it waits for the other.
+LANES = 64
+"""Number of lanes: room for as many runs. A vector register holds at most eight numbers. With
+several registers per quantity, the processor computes one while it waits for the others.
 """
 _WORD = 8
 """Size of each number of a row, bytes."""
@@ -147,6 +147,18 @@ class _RowModel(models.StructModel):
 def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
     """Generates the address that lies so many bytes behind a pointer."""
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
+
+
+def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
+    """Generates the address of rows that begin so many numbers behind a pointer to rows.
+
+    Args:
+        builder: Appends LLVM instructions.
+        pointer: The pointer.
+        words: Count of numbers in a row of one run.
+    """
+    word = ir.IntType(64)
+    return _offset_pointer(builder, pointer, ir.Constant(word, words * LANES * _WORD))
 
 
 @infer_getattr
@@ -268,13 +280,29 @@ class _RowsItem(AbstractTemplate):
             return None
         if len(set(rows.constants)) > 1:
             return None
-        return signature(LaneRow(rows, rows.constants[:1]), rows, types.intp)
+        constants = rows.constants[:1] or ((),)
+        return signature(LaneRow(rows, constants), rows, types.intp)
 
 
 @lower_builtin(operator.getitem, RowsInLane, types.Integer)
 def _get_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Generates `rows[index]`."""
     return _find_row(context, builder, sig.args[0], args[0], args[1], sig.return_type)
+
+
+@infer_global(len)
+class _RowsLength(AbstractTemplate):
+    """The type of `len(rows)`."""
+
+    def generic(self, args: Any, _keywords: Any) -> Any:
+        (rows,) = args
+        return signature(types.intp, rows) if isinstance(rows, RowsInLane) else None
+
+
+@lower_builtin(len, RowsInLane)
+def _get_length(context: Any, _builder: Any, sig: Any, _args: Any) -> Any:
+    """Generates `len(rows)`, which is a constant."""
+    return context.get_constant(types.intp, sig.args[0].count)
 
 
 @intrinsic

@@ -2,36 +2,42 @@
 
 Invariant:
     - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
-      for bit. Only the entries of ring buffers that are not used any more may differ.
+      for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries of
+      ring buffers that are not used any more, may differ.
     - The tables of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba.core import types
+from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
 from ...core.step.fused_run import NEVER_NS
 from ...core.step.jit import find_lane_address, read_lane_assembly
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import IntArray
-from ..fused import FusedRun
+from ...core.step.vectors import Array, IntArray
+from ..fused import FusedRun, RunMemory
+from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (
     BLOCK_TICKS,
     copy_link_states,
+    find_draw_addresses,
+    keep_link_states,
     repeat_deliveries,
     use_samples,
 )
+from .lane_laws import LawCode
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
-from .lane_stages import JOINTS, EndedRuns, advance_site, run_block
+from .lane_stages import STAGES_DTYPE, EndedRuns, advance_site, run_block
 from .lane_structure import RunStructure, SiteStructure, find_structure
 
-_STATE_DTYPE = np.dtype([(name, "f8", (JOINTS,)) for name in ("q", "qd", "tau_x")])
-"""Layout of the state that a site sends to its peers."""
+_FIRST_PAGES = 256
+"""Number of ticks whose states are kept at first, a power of two."""
 _REFERENCE_FIELDS = ("alpha", "alpha_rate", "gone")
 """Fields of a link's row that stage 3 of a tick writes."""
 _STATE_FIELDS = ("q", "qd", "tau_x")
@@ -48,11 +54,15 @@ class SiteTables(NamedTuple):
         environments: The rows of its environments.
         ramps: Row with the changes of its dominance factors.
         record: Row with the floats of its record.
-        states: The latest states of all sites.
-        used: Samples in use in the ticks of a block.
         peaks: Peaks, one row per bucket.
         sums: Row of its sums.
         progress: Row of its progress.
+        scratch: Row with room for the stages of the integrator.
+        law: Row with the numbers of its compiled law.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that its law sends.
+        code: Stands for the code of the law. The table itself is not used.
+        chain: Rows of the joints, if the arm is a chain.
     """
 
     site: Any
@@ -61,11 +71,15 @@ class SiteTables(NamedTuple):
     environments: Any
     ramps: Any
     record: Any
-    states: Any
-    used: Any
     peaks: Any
     sums: Any
     progress: Any
+    scratch: Any
+    law: Any
+    received: Any
+    sent: Any
+    code: Any
+    chain: Any
 
 
 class LaneLayout(NamedTuple):
@@ -80,6 +94,11 @@ class LaneLayout(NamedTuple):
         floats: Number of floats in a record.
         columns: Number of columns of the peaks.
         ramps: Shape of the table of dominance factors.
+        chain: Of the row of a joint. None for planar arms.
+        joints: Number of joints that sites share.
+        law: Largest count of numbers of a compiled law.
+        received: Largest count of numbers that a law receives from a peer.
+        sent: Largest count of numbers that a law sends.
     """
 
     site: np.dtype[Any]
@@ -90,6 +109,11 @@ class LaneLayout(NamedTuple):
     floats: int
     columns: int
     ramps: tuple[int, ...]
+    chain: np.dtype[Any] | None
+    joints: int
+    law: int
+    received: int
+    sent: int
 
 
 def find_layout(run: FusedRun) -> LaneLayout:
@@ -105,6 +129,11 @@ def find_layout(run: FusedRun) -> LaneLayout:
         floats=memory.sent.rows.shape[2],
         columns=memory.peaks.shape[2],
         ramps=tables.ramps.shape[1:],
+        chain=None if tables.chain is None else tables.chain.dtype,
+        joints=tables.links["q"].shape[2],
+        law=0 if memory.laws is None else memory.laws.rows.shape[1],
+        received=0 if tables.channel is None else tables.channel.received.shape[2],
+        sent=0 if memory.laws is None else memory.laws.sent.shape[1],
     )
 
 
@@ -119,24 +148,84 @@ def list_argument_types(
         site: Structure of the site.
     """
     first = site.first_environment
-    environments = site.actors[first:] if first >= 0 else ()
+    actors = site.actors
+    chain = _type_numbers(0, 1)
+    if layout.chain is not None:
+        # The actors of a chain are selected by the variable of a loop.
+        actors = ((),) * len(actors)
+        chain = LaneTable(layout.chain, ((("prismatic", 0),),) * layout.joints)
+    environments = actors[first:] if first >= 0 else ()
     tables = SiteTables(
         site=LaneTable(layout.site, (site.constants,)),
         links=LaneTable(layout.link, ((),) * structure.peers),
-        actors=LaneTable(layout.actor, site.actors),
+        actors=LaneTable(layout.actor, actors),
         environments=LaneTable(layout.actor, environments),
         ramps=LaneTable(np.dtype([("rows", "f8", layout.ramps)])),
         record=LaneTable(np.dtype([("floats", "f8", (layout.floats,))])),
-        states=LaneTable(_STATE_DTYPE),
-        used=LaneTable(np.dtype([("sample", "i8", (structure.peers,))])),
         peaks=LaneTable(np.dtype([("joints", "f8", (layout.columns,))])),
         sums=LaneTable(layout.sums, ((("first_environment", first),),)),
         progress=LaneTable(layout.progress),
+        scratch=LaneTable(STAGES_DTYPE),
+        law=_type_numbers(layout.law, 1),
+        received=_type_numbers(layout.received, structure.peers),
+        sent=_type_numbers(layout.sent, 1),
+        code=LawCode(site.law),
+        chain=chain,
     )
     integer = types.int64
-    numbers = (integer, integer, integer, types.float64, integer, integer, integer, integer)
+    numbers = (*(integer,) * 3, types.float64, *(integer,) * 5)
+    states = types.Array(types.float64, 4, "C")
+    used = types.Array(types.int64, 3, "C")
+    columns = types.Array(types.int64, 2, "C")
     table = types.Array(types.float64, 2, "C")
-    return (*numbers, *tables, table)
+    return (*numbers, *tables, states, used, columns, table)
+
+
+def _type_numbers(count: int, rows: int) -> LaneTable:
+    """Returns Numba's type of a table whose rows contain one vector, `numbers`.
+
+    Args:
+        count: Count of numbers.
+        rows: Number of rows.
+    """
+    return LaneTable(np.dtype([("numbers", "f8", (count,))]), ((),) * rows)
+
+
+def choose_code(layout: LaneLayout) -> Callable[..., None]:
+    """Returns the function that computes a tick of a site in lanes."""
+    return advance_site if layout.chain is None else advance_chain_site
+
+
+def _find_addresses(run: FusedRun, structure: RunStructure) -> IntArray:
+    """Compiles the code of each site of a run, or loads it, and returns its addresses.
+
+    Raises:
+        NumbaError: A law of a user cannot be compiled in lanes.
+    """
+    layout = find_layout(run)
+    addresses = []
+    for site in structure.sites:
+        arguments = list_argument_types(layout, structure, site)
+        addresses.append(find_lane_address(choose_code(layout), arguments))
+    return np.array(addresses)
+
+
+def explain_uncompilable(run: FusedRun) -> str:
+    """Explains why the laws of a run cannot be compiled in lanes, although they can be alone.
+
+    The code is compiled for this answer.
+
+    Args:
+        run: The run before its first tick. There must be no obstacle, see `find_obstacle`.
+
+    Returns:
+        The reason. Empty if there is none.
+    """
+    try:
+        _find_addresses(run, find_structure(run))
+    except NumbaError:
+        return "control laws that cannot be compiled side by side"
+    return ""
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
@@ -147,8 +236,9 @@ def read_assembly(run: FusedRun, i: int) -> str:
         i: Index of the site.
     """
     structure = find_structure(run)
-    arguments = list_argument_types(find_layout(run), structure, structure.sites[i])
-    return read_lane_assembly(advance_site, arguments)
+    layout = find_layout(run)
+    arguments = list_argument_types(layout, structure, structure.sites[i])
+    return read_lane_assembly(choose_code(layout), arguments)
 
 
 class _LinksOfRun:
@@ -162,7 +252,9 @@ class _LinksOfRun:
         self._run = run
         self._ticks = 0
 
-    def set_pending(self, ticks: int, links: NDArray[Any], states: NDArray[np.float64]) -> None:
+    def set_pending(
+        self, ticks: int, links: NDArray[Any], states: Array, received: Array
+    ) -> None:
         """Notes that the run has advanced, and with which results.
 
         Args:
@@ -170,10 +262,11 @@ class _LinksOfRun:
             links: Rows of its links after these ticks. Only fields of the sample in use, and
                 fields that stage 3 of a tick writes, are up to date.
             states: The latest states of its sites, see `repeat_deliveries`.
+            received: Numbers of laws that came with the samples in use, shape (N P, C).
         """
-        self._run.pending_deliveries = partial(self._update, ticks, links, states)
+        self._run.pending_deliveries = partial(self._update, ticks, links, states, received)
 
-    def _update(self, ticks: int, links: NDArray[Any], states: NDArray[np.float64]) -> None:
+    def _update(self, ticks: int, links: NDArray[Any], states: Array, received: Array) -> None:
         """Brings the links of the run up to date, see `set_pending`."""
         memory = self._run.memory
         tables = memory.tables
@@ -186,12 +279,16 @@ class _LinksOfRun:
             dues=tables.dues,
             calendars=tables.calendars,
             points=tables.points,
+            channel=tables.channel,
+            joints=tables.links["q"].shape[2],
             states=states,
         )
         self._ticks = ticks
         memory.next_samples[:] = max(ticks - 1, 0)
         for name in (*_REFERENCE_FIELDS, *_STATE_FIELDS):
             tables.links[name] = links.reshape(tables.links.shape)[name]
+        if tables.channel is not None:
+            tables.channel.received[:] = received.reshape(tables.channel.received.shape)
 
 
 class LaneRun:
@@ -200,12 +297,13 @@ class LaneRun:
     Args:
         runs: The runs before their first tick, at most `LANES`. They must have the same
             structure, see `find_structure`, and no obstacle, see `find_obstacle`.
+        record_rows: Number of latest records of each site that are kept, a power of two.
 
     Attributes:
         runs: The runs that are in the lanes. `advance_to` writes the results into them.
     """
 
-    def __init__(self, runs: Sequence[FusedRun]) -> None:
+    def __init__(self, runs: Sequence[FusedRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
         structure = find_structure(runs[0])
         assert all(find_structure(run) == structure for run in runs)
@@ -220,13 +318,16 @@ class LaneRun:
         self._rate_hz = int(first.site["rate_hz"][0, 0])
         self._table = first.table
         self._ticks = 0
-        self._deliveries = [copy_link_states(arrays) for arrays in tables]
+        self._deliveries = copy_link_states(tables)
+        self._draws = find_draw_addresses()
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
 
-        # A state waits at most as long as a sample waits in a calendar.
-        self._pages = max(arrays.calendars.shape[2] for arrays in tables)
-        self._states = allocate_words(self._sites * (self._pages + 1), 3 * JOINTS)
-        self._used = allocate_words(self._sites * BLOCK_TICKS, structure.peers)
+        self._pages = _FIRST_PAGES
+        # A state occupies whole cache lines, because each lane needs that of another tick.
+        width = -(-(3 * layout.joints + layout.sent) // 8) * 8
+        self._states = np.zeros((self._sites, self._pages + 1, LANES, width))
+        self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
+        self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
 
         def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
@@ -248,22 +349,29 @@ class LaneRun:
         self._sums = pack([memory.sums for memory in memories])
         self._progress = pack([memory.progress for memory in memories])
         self._ramps = pack([_view_rows(arrays.ramps) for arrays in tables])
-        self._records = allocate_words(self._sites, layout.floats)
+        records = allocate_words(self._sites * record_rows, layout.floats)
+        self._records = records.reshape(self._sites, record_rows, layout.floats, LANES)
+        self._laws = allocate_words(self._sites, layout.law)
+        self._sent = allocate_words(self._sites, layout.sent)
+        self._received = allocate_words(self._sites * structure.peers, layout.received)
+        self._columns = np.zeros((self._sites, structure.peers, layout.received), np.int64)
+        self._code = allocate_words(1, 1)
+        self._chain = allocate_words(self._sites, 0)
+        if first.chain is not None:
+            self._chain = pack([np.asarray(arrays.chain) for arrays in tables])
+        self._put_laws(memories)
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
             site_rows=np.zeros_like(self._site),
-            records=np.zeros_like(self._records),
+            records=np.zeros_like(self._records[:, 0]),
             sums=np.zeros_like(self._sums),
             progress=np.zeros_like(self._progress),
+            laws=np.zeros_like(self._laws),
+            sent=np.zeros_like(self._sent),
             peaks=np.zeros((self._sites, layout.columns, LANES), np.int64),
         )
         self._put_first_states(tables)
-        self._addresses = np.array(
-            [
-                find_lane_address(advance_site, list_argument_types(layout, structure, site))
-                for site in structure.sites
-            ]
-        )
+        self._addresses = _find_addresses(runs[0], structure)
 
     def _put_first_states(self, tables: Sequence[Any]) -> None:
         """Writes the states of all sites before the first tick, which their peers start with.
@@ -271,18 +379,34 @@ class LaneRun:
         Args:
             tables: Arrays of the sites of each run.
         """
-        states = self._states.reshape(self._sites, self._pages + 1, 3 * JOINTS, LANES)
-        floats = states.view(np.float64)
         for lane, arrays in enumerate(tables):
             for j in range(self._sites):
                 # The peers of a site are all other sites: site 0 is a peer of site 1.
                 receiver = 1 if j == 0 else 0
                 link = arrays.links[receiver, j if j < receiver else j - 1]
                 for n, name in enumerate(_STATE_FIELDS):
-                    floats[j, self._pages, n * JOINTS : (n + 1) * JOINTS, lane] = link[name]
+                    joints = self._layout.joints
+                    columns = slice(n * joints, (n + 1) * joints)
+                    self._states[j, self._pages, lane, columns] = link[name]
+
+    def _put_laws(self, memories: Sequence[RunMemory]) -> None:
+        """Copies the numbers of compiled laws into the lanes.
+
+        Args:
+            memories: Arrays of each run.
+        """
+        for lane in range(LANES):
+            # Lanes without a run repeat the first run.
+            memory = memories[lane if lane < len(memories) else 0]
+            if memory.laws is not None:
+                self._laws[:, :, lane] = memory.laws.rows.view(np.int64)
+                self._sent[:, :, lane] = memory.laws.sent.view(np.int64)
+        channel = memories[0].tables.channel
+        if channel is not None:
+            self._columns[:] = channel.columns
 
     def _find_tables(self) -> IntArray:
-        """Returns the address of each table of each site, shape (N, 11)."""
+        """Returns the address of each table of each site, shape (N, 15)."""
         structure = self._structure
         addresses = []
         for i in range(self._sites):
@@ -294,12 +418,16 @@ class LaneRun:
                     max(structure.sites[i].first_environment, 0) :
                 ],
                 ramps=_share(self._ramps, i, self._sites),
-                record=_share(self._records, i, self._sites),
-                states=self._states,
-                used=_share(self._used, i, self._sites),
+                record=self._records[i],
                 peaks=self._peaks[i],
                 sums=_share(self._sums, i, self._sites),
                 progress=_share(self._progress, i, self._sites),
+                scratch=self._scratch,
+                law=_share(self._laws, i, self._sites),
+                received=_share(self._received, i, self._sites),
+                sent=_share(self._sent, i, self._sites),
+                code=self._code,
+                chain=_share(self._chain, i, self._sites),
             )
             _check_distinct(rows)
             addresses.append([table.ctypes.data for table in rows])
@@ -320,24 +448,53 @@ class LaneRun:
         for lane in lanes:
             self.runs[lane].plan([ticks] * self._sites)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
-        tables = self._find_tables()
-        used = self._used.reshape(self._sites, BLOCK_TICKS, self._structure.peers, LANES)
+        self._step_to(ticks)
+        for lane in lanes:
+            self._write_back(lane, self.runs[lane], until_s)
+
+    def _use_samples(self, first: int, count: int) -> int:
+        """Finds the samples that are used in a block of ticks, see `use_samples`.
+
+        Args:
+            first: First tick of the block.
+            count: Number of ticks.
+
+        Returns:
+            The largest age of a sample in use, ticks.
+        """
+        return use_samples(
+            first,
+            count,
+            self._rate_hz,
+            self._ended.ticks,
+            self._deliveries,
+            self._draws,
+            self._used,
+        )
+
+    def _step_to(self, ticks: int) -> None:
+        """Steps all runs until they have made a number of ticks, or have ended.
+
+        Args:
+            ticks: Number of ticks since the start of the runs.
+        """
         present = EndedRuns(
             ticks=self._ended.ticks,
             site_rows=self._site,
             records=self._records,
             sums=self._sums,
             progress=self._progress,
+            laws=self._laws,
+            sent=self._sent,
             peaks=self._ended.peaks,
         )
         site_fields: Any = self._layout.site.fields
         _, mode_offset = site_fields["mode"]
+        tables = self._find_tables()
         running = 1
         while self._ticks < ticks and running:
             count = min(BLOCK_TICKS, ticks - self._ticks)
-            for lane in lanes:
-                states = self._deliveries[lane]
-                use_samples(self._ticks, count, self._rate_hz, lane, states, used)
+            self._keep_states(self._use_samples(self._ticks, count))
             running = run_block(
                 first=self._ticks,
                 count=count,
@@ -346,16 +503,36 @@ class LaneRun:
                 settled_rad=self._structure.settled_rad,
                 pages=self._pages,
                 mode_word=mode_offset // 8,
+                record_rows=self._records.shape[1],
                 addresses=self._addresses,
                 tables=tables,
+                states=self._states,
+                used=self._used,
+                columns=self._columns,
                 table=self._table,
                 peaks=self._peaks,
                 present=present,
                 ended=self._ended,
             )
             self._ticks += count
-        for lane in lanes:
-            self._write_back(lane, self.runs[lane], until_s)
+
+    def _keep_states(self, ticks: int) -> None:
+        """Makes room for the states of more ticks, if necessary.
+
+        A sample that is older than the sample in use is never used any more. Therefore far
+        fewer states are needed than a link could delay.
+
+        Args:
+            ticks: Number of ticks before the present one whose states are needed.
+        """
+        while self._pages <= ticks:
+            old_pages = self._pages
+            self._pages *= 2
+            states = np.zeros((self._sites, self._pages + 1, *self._states.shape[2:]))
+            kept = np.arange(max(self._ticks - old_pages, 0), self._ticks)
+            states[:, kept % self._pages] = self._states[:, kept % old_pages]
+            states[:, -1] = self._states[:, -1]
+            self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
         """Removes all runs but some from the lanes, so that only these advance further.
@@ -368,11 +545,13 @@ class LaneRun:
         lanes = list(chosen)
         for lane_table in (
             *(self._site, self._links, self._actors, self._environments, self._sums),
-            *(self._progress, self._ramps, self._records, self._states, self._peaks),
+            *(self._progress, self._ramps, self._records, self._peaks),
+            *(self._laws, self._sent, self._received, self._chain),
         ):
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
+        self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
         self._ended.ticks[:] = -1
-        self._deliveries = [self._deliveries[lane] for lane in lanes]
+        self._deliveries = keep_link_states(self._deliveries, lanes)
         self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
         self.runs = [self.runs[lane] for lane in lanes]
 
@@ -398,7 +577,8 @@ class LaneRun:
         has_ended = ended_ticks >= 0
         ticks = ended_ticks if has_ended else self._ticks
         site_rows = self._ended.site_rows if has_ended else self._site
-        records = self._ended.records if has_ended else self._records
+        record_row = (ticks - 1) & (self._records.shape[1] - 1)
+        records = self._ended.records if has_ended else self._records[:, record_row]
         sums = self._ended.sums if has_ended else self._sums
         progress = self._ended.progress if has_ended else self._progress
 
@@ -423,15 +603,20 @@ class LaneRun:
         page = (ticks - 1) & (memory.sent.t_ns.shape[1] - 1)
         memory.sent.t_ns[:, page] = tick_ns(ticks - 1, self._rate_hz)
         memory.sent.rows[:, page] = records[:, :, lane].view(np.float64)
+        if memory.laws is not None:
+            laws = self._ended.laws if has_ended else self._laws
+            sent = self._ended.sent if has_ended else self._sent
+            memory.laws.rows[:] = laws[:, :, lane].view(np.float64)
+            memory.laws.sent[:] = sent[:, :, lane].view(np.float64)
         run.ran_s = until_s
         if run.diverged_s is not None:
             run.ran_s = run.diverged_s
         elif not has_ended:
-            states = np.ascontiguousarray(self._states[:, :, lane]).view(np.float64)
             self._links_of_runs[lane].set_pending(
                 ticks=ticks,
                 links=np.ascontiguousarray(self._links[:, :, lane]).view(self._layout.link),
-                states=states.reshape(self._sites, self._pages + 1, 3 * JOINTS),
+                states=self._states[:, :, lane].copy(),
+                received=self._received[:, :, lane].view(np.float64),
             )
 
 

@@ -12,6 +12,9 @@ Invariant:
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from ...core.arms import two_link_stages
 from ...core.arms.exogenous import (
     NO_TORQUE,
     SourceTorque,
@@ -20,18 +23,32 @@ from ...core.arms.exogenous import (
     torque_on_arm,
 )
 from ...core.plug.plugged import call_address
-from ...core.step.fused_run import update_peaks, update_sums
+from ...core.step.fused_run import first_sent_column, update_peaks, update_sums
 from ...core.step.jit import lane_leaf, leaf, set_lane_form
-from ...core.step.kernel import act_stages, reference_stages, torque_stage
+from ...core.step.kernel import (
+    adapts,
+    emit_stages,
+    finish_advance,
+    hold_motor_torque,
+    reference_stages,
+    torque_stage,
+)
+from ...core.step.site_setup import Law
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import Array, IntArray, Vector
+from ...core.step.vectors import Array, IntArray, Pair, Vector, five, pair, put_pair
+from .lane_laws import compute_law
 from .lane_rows import Words, in_lane, pointer_to, select_row
 
 _DIVERGED = int(Mode.DIVERGED)
+_USER = int(Law.USER)
 JOINTS = 2
 """Number of joints of the arms that lanes support."""
 TAU_X_COLUMN = 5 * JOINTS
 """Column of tau_x in a record, after q, qd, q_des, qd_des and tau."""
+STAGES_DTYPE = np.dtype(
+    [(name, "f8", (JOINTS,)) for name in ("qdd_1", "qd_2", "qdd_2", "qd_3", "qdd_3")]
+)
+"""Layout of the velocities and accelerations at the first stages of the integrator."""
 
 
 def _no_torque(
@@ -86,6 +103,43 @@ def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]
 set_lane_form(torque_on_arm, _choose_form)
 
 
+@leaf
+def _advance_stage(
+    t_s: float,
+    ahead_s: float,
+    s: Any,
+    qd_before: Pair,
+    qdd_before: Pair,
+    actors: Any,
+    table: TorqueTable,
+) -> tuple[Pair, Pair]:
+    """Evaluates a stage of the integrator, see `two_link_stages.advance_stage`.
+
+    Args:
+        t_s: Time at the beginning of the period, s.
+        ahead_s: Time of the stage after the beginning of the period, s.
+        s: Row of the site.
+        qd_before: Joint velocities at the stage before, rad/s.
+        qdd_before: Joint accelerations at the stage before, rad/s^2.
+        actors: Rows of its operators and environments.
+        table: Their tables.
+    """
+    return two_link_stages.advance_stage(
+        t_s=t_s,
+        ahead_s=ahead_s,
+        q=pair(s.q),
+        qd=pair(s.qd),
+        qd_before=qd_before,
+        qdd_before=qdd_before,
+        u=pair(s.u),
+        theta=five(s.theta),
+        g=s.g,
+        lengths=pair(s.lengths),
+        actors=actors,
+        table=table,
+    )
+
+
 @lane_leaf
 def advance_site(
     k: int,
@@ -96,17 +150,25 @@ def advance_site(
     block_row: int,
     pages: int,
     bucket: int,
+    record_row: int,
     site: Any,
     links: Any,
     actors: Any,
     environments: Any,
     ramps: Any,
     record: Any,
-    states: Any,
-    used: Any,
     peaks: Any,
     sums: Any,
     progress: Any,
+    scratch: Any,
+    law: Any,
+    received: Any,
+    sent: Any,
+    code: Any,
+    _chain: Any,
+    states: Array,
+    used: IntArray,
+    columns: IntArray,
     table: TorqueTable,
 ) -> None:
     """Computes one tick of a site for several runs.
@@ -122,36 +184,56 @@ def advance_site(
         block_row: Row of the tick in `used`.
         pages: Number of latest states of each site in `states`, a power of two.
         bucket: Row of the tick in `peaks`.
+        record_row: Row of the tick in `record`.
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
         environments: The rows of its environments among them.
         ramps: Row with the changes of its dominance factors.
-        record: Row with the floats of its record; written.
-        states: The latest states of all sites. Each site has `pages` rows, and one row for the
-            state before its first tick.
-        used: For each tick of a block, the sample of each peer that is in use; -1: none yet.
+        record: Rows with the floats of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
+        scratch: Row with room for the stages of the integrator, see `STAGES_DTYPE`.
+        law: Row with the numbers of the site's compiled law.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that the law sends.
+        code: Stands for the code of the law, see `LawCode`.
+        states: The latest states of all sites, q, qd, tau_x and the numbers that the law sent,
+            shape (N, pages + 1, LANES, width). The last page holds the state before the first
+            tick.
+        used: Sample in use by peer, lane and tick of a block; -1: none yet.
+        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
     # 2 release: the state of each peer that is in use
     for lane in range(lanes):
         rows = in_lane(links, lane)
-        samples = in_lane(used, lane)[block_row].sample
         for p in range(rows.shape[0]):
             link = rows[p]
-            sample = samples[p]
+            sample = used[p, lane, block_row]
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
-            state = in_lane(states, lane)[peer * (pages + 1) + page]
+            if in_lane(site, lane)[0].law == _USER:
+                link.new = sample > link.used
+                link.used_ns = t_ns if sample > link.used else link.used_ns
             link.used = sample
             for c in range(JOINTS):
-                link.q[c] = state.q[c]
-                link.qd[c] = state.qd[c]
-                link.tau_x[c] = state.tau_x[c]
+                link.q[c] = states[peer, page, lane, c]
+                link.qd[c] = states[peer, page, lane, JOINTS + c]
+                link.tau_x[c] = states[peer, page, lane, 2 * JOINTS + c]
+
+    for p in range(columns.shape[0]):
+        peer = p if p < i else p + 1
+        for c in range(columns.shape[1]):
+            column = columns[p, c]
+            for lane in range(lanes):
+                sample = used[p, lane, block_row]
+                number = 0.0
+                if sample >= 0 and column >= 0:
+                    number = states[peer, sample & (pages - 1), lane, 3 * JOINTS + column]
+                in_lane(received, lane)[p].numbers[c] = number
 
     # 3 reference, 4 errors, 5 estimate
     for lane in range(lanes):
@@ -166,29 +248,121 @@ def advance_site(
             chain=None,
         )
 
-    # 6 torque, 7 emit, 8 advance
+    # 6 torque
     for lane in range(lanes):
-        floats = in_lane(record, lane)[0].floats
         torque_stage(in_lane(site, lane), None)
-        act_stages(
-            k=k,
-            t_ns=t_ns,
-            site=in_lane(site, lane),
+    for lane in range(lanes):
+        compute_law(
+            code,
+            k,
+            t_ns,
+            in_lane(site, lane),
+            in_lane(links, lane),
+            in_lane(law, lane),
+            in_lane(received, lane),
+            in_lane(sent, lane),
+        )
+
+    # 6 limits of the torque, 7 emit
+    for lane in range(lanes):
+        floats = in_lane(record, lane)[record_row].floats
+        emit_stages(k=k, t_ns=t_ns, s=in_lane(site, lane)[0], chain=None, record=floats)
+        page = k & (pages - 1)
+        for c in range(JOINTS):
+            states[i, page, lane, c] = floats[c]
+            states[i, page, lane, JOINTS + c] = floats[JOINTS + c]
+            states[i, page, lane, 2 * JOINTS + c] = floats[TAU_X_COLUMN + c]
+
+    for c in range(in_lane(site, 0)[0].sent):
+        for lane in range(lanes):
+            number = in_lane(sent, lane)[0].numbers[c]
+            floats = in_lane(record, lane)[record_row].floats
+            floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
+            states[i, k & (pages - 1), lane, 3 * JOINTS + c] = number
+
+    # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
+    # processor begins with the next lanes while it waits for results of the previous ones.
+    t_s = t_ns * 1e-9
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        if s.mode != _DIVERGED:
+            hold_motor_torque(k, s)
+        stages = in_lane(scratch, lane)[0]
+        qdd = two_link_stages.find_stage_acceleration(
+            t_s=t_s,
+            q=pair(s.q),
+            qd=pair(s.qd),
+            u=pair(s.u),
+            theta=five(s.theta),
+            g=s.g,
+            lengths=pair(s.lengths),
             actors=in_lane(actors, lane),
             table=table,
-            chain=None,
-            record=floats,
         )
-        state = in_lane(states, lane)[i * (pages + 1) + (k & (pages - 1))]
-        for c in range(JOINTS):
-            state.q[c] = floats[c]
-            state.qd[c] = floats[JOINTS + c]
-            state.tau_x[c] = floats[TAU_X_COLUMN + c]
+        put_pair(stages.qdd_1, qdd)
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        stages = in_lane(scratch, lane)[0]
+        qd, qdd = _advance_stage(
+            t_s=t_s,
+            ahead_s=0.5 * (1.0 / s.rate_hz),
+            s=s,
+            qd_before=pair(s.qd),
+            qdd_before=pair(stages.qdd_1),
+            actors=in_lane(actors, lane),
+            table=table,
+        )
+        put_pair(stages.qd_2, qd)
+        put_pair(stages.qdd_2, qdd)
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        stages = in_lane(scratch, lane)[0]
+        qd, qdd = _advance_stage(
+            t_s=t_s,
+            ahead_s=0.5 * (1.0 / s.rate_hz),
+            s=s,
+            qd_before=pair(stages.qd_2),
+            qdd_before=pair(stages.qdd_2),
+            actors=in_lane(actors, lane),
+            table=table,
+        )
+        put_pair(stages.qd_3, qd)
+        put_pair(stages.qdd_3, qdd)
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        stages = in_lane(scratch, lane)[0]
+        h_s = 1.0 / s.rate_hz
+        qd_4, qdd_4 = _advance_stage(
+            t_s=t_s,
+            ahead_s=h_s,
+            s=s,
+            qd_before=pair(stages.qd_3),
+            qdd_before=pair(stages.qdd_3),
+            actors=in_lane(actors, lane),
+            table=table,
+        )
+        q, qd = two_link_stages.combine_stages(
+            h_s=h_s,
+            q=pair(s.q),
+            qd=pair(s.qd),
+            qd_2=pair(stages.qd_2),
+            qd_3=pair(stages.qd_3),
+            qd_4=qd_4,
+            qdd_1=pair(stages.qdd_1),
+            qdd_2=pair(stages.qdd_2),
+            qdd_3=pair(stages.qdd_3),
+            qdd_4=qdd_4,
+        )
+        if s.mode != _DIVERGED:
+            is_adapting = adapts(s)
+            if not two_link_stages.move_arm(s, q, qd):
+                s.mode = _DIVERGED
+            finish_advance(s, None, is_adapting)
 
     # Statistics of the run.
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
-        floats = in_lane(record, lane)[0].floats
+        floats = in_lane(record, lane)[record_row].floats
         site_sums = in_lane(sums, lane)[0]
         update_peaks(
             row=floats,
@@ -224,6 +398,8 @@ class EndedRuns(NamedTuple):
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words of a row, LANES).
         progress: Rows of the progress, shape (N, words of a row, LANES).
+        laws: Numbers of compiled laws, shape (N, numbers, LANES).
+        sent: Numbers that these laws send, shape (N, numbers, LANES).
         peaks: Peaks in the bucket of the instant, shape (N, 3 n, LANES).
     """
 
@@ -232,6 +408,8 @@ class EndedRuns(NamedTuple):
     records: Words
     sums: Words
     progress: Words
+    laws: Words
+    sent: Words
     peaks: Words
 
 
@@ -255,6 +433,7 @@ def _keep_ended_runs(
     runs: int,
     mode_word: int,
     bucket: int,
+    record_row: int,
     peaks: Words,
     present: EndedRuns,
     ended: EndedRuns,
@@ -266,8 +445,10 @@ def _keep_ended_runs(
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
         bucket: The present bucket.
+        record_row: Row of the latest record.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
-        present: Numbers of all runs now. Its peaks are not used.
+        present: Numbers of all runs now, with several rows of records per site. Its peaks are
+            not used.
         ended: Written.
 
     Returns:
@@ -285,9 +466,11 @@ def _keep_ended_runs(
             continue
         ended.ticks[lane] = ticks
         _copy_lane(lane, present.site_rows, ended.site_rows)
-        _copy_lane(lane, present.records, ended.records)
+        _copy_lane(lane, present.records[:, record_row], ended.records)
         _copy_lane(lane, present.sums, ended.sums)
         _copy_lane(lane, present.progress, ended.progress)
+        _copy_lane(lane, present.laws, ended.laws)
+        _copy_lane(lane, present.sent, ended.sent)
         _copy_lane(lane, peaks[:, bucket], ended.peaks)
     return running
 
@@ -301,8 +484,12 @@ def run_block(
     settled_rad: float,
     pages: int,
     mode_word: int,
+    record_rows: int,
     addresses: IntArray,
     tables: IntArray,
+    states: Array,
+    used: IntArray,
+    columns: IntArray,
     table: Array,
     peaks: Words,
     present: EndedRuns,
@@ -318,9 +505,14 @@ def run_block(
         settled_rad: Position error below which an arm counts as settled, rad.
         pages: Number of latest states of each site, a power of two.
         mode_word: Index of the mode among the words of a site's row.
-        addresses: Address of the code of `advance_site` for each site, shape (N,).
+        record_rows: Number of latest records of each site that are kept, a power of two.
+        addresses: Address of the code of `advance_site` or `advance_chain_site` for each site,
+            shape (N,).
         tables: For each site the addresses of its tables, in the order of the arguments of
-            `advance_site`, shape (N, 11).
+            `advance_site`, shape (N, 15).
+        states: The latest states of all sites, see `advance_site`.
+        used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
+        columns: Indices of the numbers that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: The numbers of all runs.
@@ -330,12 +522,14 @@ def run_block(
         The number of runs that have not ended.
     """
     running = runs
-    # Whole vector registers: the numbers of lanes without a run have no meaning.
-    lanes = (runs + 7) // 8 * 8
+    # Whole vector registers: the numbers of lanes without a run have no meaning. One or two
+    # lanes more are faster without vectors.
+    lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
     for block_row in range(count):
         k = first + block_row
         t_ns = tick_ns(k, rate_hz)
         bucket = k * BUCKETS_PER_S // rate_hz
+        record_row = k & (record_rows - 1)
         for i in range(addresses.shape[0]):
             call_address(
                 addresses[i],
@@ -348,6 +542,7 @@ def run_block(
                     block_row,
                     pages,
                     bucket,
+                    record_row,
                     pointer_to(tables[i, 0]),
                     pointer_to(tables[i, 1]),
                     pointer_to(tables[i, 2]),
@@ -359,6 +554,13 @@ def run_block(
                     pointer_to(tables[i, 8]),
                     pointer_to(tables[i, 9]),
                     pointer_to(tables[i, 10]),
+                    pointer_to(tables[i, 11]),
+                    pointer_to(tables[i, 12]),
+                    pointer_to(tables[i, 13]),
+                    pointer_to(tables[i, 14]),
+                    states,
+                    used[i],
+                    columns[i],
                     table,
                 ),
             )
@@ -367,6 +569,7 @@ def run_block(
             runs=runs,
             mode_word=mode_word,
             bucket=bucket,
+            record_row=record_row,
             peaks=peaks,
             present=present,
             ended=ended,

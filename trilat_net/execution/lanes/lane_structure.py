@@ -13,8 +13,10 @@ import numba
 import numpy as np
 
 from ...core.arms.exogenous import LIVE_KINDS, OWN_KINDS
+from ...core.step.site_arrays import SiteArrays
 from ...core.step.site_setup import StaleAction
 from ..fused import FusedRun
+from .lane_laws import LaneLaw, describe_lane_law
 from .lane_rows import Constants
 
 SITE_CONSTANTS = (
@@ -34,11 +36,13 @@ class SiteStructure(NamedTuple):
         constants: Constants of the site.
         actors: Constants of each operator and environment, the operators first.
         first_environment: Index of the first environment; -1: none.
+        law: Compiled law of the site.
     """
 
     constants: Constants
     actors: tuple[Constants, ...]
     first_environment: int
+    law: LaneLaw
 
 
 class RunStructure(NamedTuple):
@@ -85,9 +89,11 @@ def find_obstacle(run: FusedRun) -> str:
     if config.DISABLE_JIT:
         return "Numba is disabled"
     if tables.chain is not None:
-        return "arms that are chains of joints"
-    if tables.channel is not None:
-        return "control laws that the kernel does not contain"
+        obstacle = _find_obstacle_of_chains(tables)
+        if obstacle:
+            return obstacle
+    if run.memory.has_plain_law:
+        return "control laws in plain Python"
     if run.has_programs:
         return "programs that move an arm"
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
@@ -102,6 +108,24 @@ def find_obstacle(run: FusedRun) -> str:
     return ""
 
 
+def _find_obstacle_of_chains(tables: SiteArrays) -> str:
+    """Explains why runs with chains of joints cannot be computed together.
+
+    Args:
+        tables: Arrays of all sites of a run.
+    """
+    if tables.channel is not None:
+        return "compiled laws of arms that are chains of joints"
+    counts = set(tables.site["joints"].ravel().tolist())
+    if tables.site["task"].any():
+        return "chains of joints whose sites share poses"
+    if counts != {tables.links["q"].shape[2]}:
+        return "chains with different numbers of joints"
+    if tables.chain is not None and tables.chain["prismatic"].any():
+        return "chains with prismatic joints"
+    return ""
+
+
 def find_structure(run: FusedRun) -> RunStructure:
     """Returns the structure of a run.
 
@@ -111,12 +135,15 @@ def find_structure(run: FusedRun) -> RunStructure:
     memory = run.memory
     tables = memory.tables
     sites = []
-    for site, actors, sums in zip(tables.site, tables.actors, memory.sums, strict=True):
+    pairs = zip(tables.site, tables.actors, memory.sums, strict=True)
+    for i, (site, actors, sums) in enumerate(pairs):
         rows = _list_actors(actors)
+        columns = None if tables.channel is None else tables.channel.columns[i]
         structure = SiteStructure(
             constants=_read_constants(site[0], SITE_CONSTANTS),
             actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
             first_environment=int(sums["first_environment"]),
+            law=describe_lane_law(memory.compiled_laws.get(i), columns),
         )
         sites.append(structure)
     return RunStructure(

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 from ..fused import FusedRun
 from .lane_rows import LANES
-from .lane_run import LaneRun
+from .lane_run import LaneRun, explain_uncompilable
 from .lane_structure import RunStructure, find_obstacle, find_structure
 
 LEAST_RUNS = 4
@@ -22,15 +22,23 @@ class RunGroup:
         members: Indices of the runs in the sequence that was divided into groups.
         runs: The runs before their first tick.
         in_lanes: True to compute them in lanes. They must have the same structure.
+        obstacle: Property because of which the runs cannot be computed in lanes, or empty.
 
     Attributes:
         members: Indices of the runs that are left in the group.
+        obstacle: As the argument.
     """
 
     def __init__(
-        self, members: Sequence[int], runs: Sequence[FusedRun], *, in_lanes: bool
+        self,
+        members: Sequence[int],
+        runs: Sequence[FusedRun],
+        *,
+        in_lanes: bool,
+        obstacle: str = "",
     ) -> None:
         self.members = list(members)
+        self.obstacle = obstacle
         self._runs = list(runs)
         self._lanes = LaneRun(runs) if in_lanes else None
 
@@ -41,8 +49,14 @@ class RunGroup:
             until_s: The time, s, later than that of the previous call.
         """
         if self._lanes is not None:
-            self._lanes.advance_to(until_s)
-            return
+            try:
+                self._lanes.advance_to(until_s)
+            except Exception:
+                # The law of some run failed, which ends the tick of all runs. Each run still
+                # has the state of the previous call. Now only the run whose law fails ends.
+                self._lanes = None
+            else:
+                return
         for run in self._runs:
             run.advance_to(until_s)
 
@@ -70,16 +84,20 @@ def group_runs(runs: Sequence[FusedRun]) -> Iterator[RunGroup]:
     """
     groups: dict[RunStructure, list[int]] = {}
     for index, run in enumerate(runs):
-        if find_obstacle(run):
-            yield RunGroup([index], [run], in_lanes=False)
+        obstacle = find_obstacle(run)
+        if obstacle:
+            yield RunGroup([index], [run], in_lanes=False, obstacle=obstacle)
         else:
             groups.setdefault(find_structure(run), []).append(index)
     for indices in groups.values():
         for first in range(0, len(indices), LANES):
             members = indices[first : first + LANES]
             chosen = [runs[index] for index in members]
+            obstacle = ""
             if len(members) >= LEAST_RUNS:
-                yield RunGroup(members, chosen, in_lanes=True)
-                continue
+                obstacle = explain_uncompilable(chosen[0])
+                if not obstacle:
+                    yield RunGroup(members, chosen, in_lanes=True)
+                    continue
             for index, run in zip(members, chosen, strict=True):
-                yield RunGroup([index], [run], in_lanes=False)
+                yield RunGroup([index], [run], in_lanes=False, obstacle=obstacle)

@@ -30,7 +30,7 @@ from ...analysis.certificate.premises import explain_no_functional, find_unjudge
 from ...analysis.certificate.stability_certificate import Certificate, certify
 from ...core.step.vectors import Array
 from ...log.log_reader import Log
-from ...scenario.code_consent import may_run_user_laws
+from ...own_code.code_consent import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless

@@ -33,7 +33,7 @@ from ...core.arms.chain import LINK_PARAMETERS
 from ...core.step.vectors import Array
 from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
-from ...scenario.code_consent import find_user_laws
+from ...own_code.code_consent import find_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless

@@ -26,7 +26,7 @@ from ...analysis.timeline import recorded_end_s
 from ...core.step.vectors import Array
 from ...errors import UsageError
 from ...log.log_reader import Log
-from ...scenario.code_consent import may_run_user_laws
+from ...own_code.code_consent import may_run_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .figure_entry import draws

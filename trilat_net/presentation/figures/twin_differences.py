@@ -38,7 +38,7 @@ from ...core.step.vectors import Array
 from ...execution.fused import explain_not_repeatable
 from ...execution.twins import SMALLEST, TwinPath, Twins
 from ...log.log_reader import Log
-from ...scenario.code_consent import may_run_user_laws
+from ...own_code.code_consent import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws

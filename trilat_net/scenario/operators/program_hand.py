@@ -25,8 +25,8 @@ from ...core.step.site_step import Site
 from ...core.step.ticks import NS_PER_S, tick_ns
 from ...core.step.vectors import Array
 from ...errors import describe_exception
-from ..class_arguments import make_own_instance
-from ..imported_code import (
+from ...own_code.class_arguments import make_own_instance
+from ...own_code.imported_code import (
     CLASS_PATTERN,
     CodeKey,
     Watch,

@@ -1,4 +1,6 @@
-"""A policy at m2 and a person at m1 of one session, moved through the plugins, and what is to come of it."""
+"""A session in which a policy moves m2 and a person moves m1 through the plugins, and its
+expected results.
+"""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -15,11 +17,11 @@ ROBOT, TELEOPERATOR = "lerobot_robot_trilat", "lerobot_teleoperator_trilat"
 
 
 def drive(
-    found: dict[str, ModuleType], running: Any, wait_s: Callable[[float], Any], **reach: Any
+    plugins: dict[str, ModuleType], running: Any, wait_s: Callable[[float], Any], **reach: Any
 ) -> dict[str, Any]:
-    """Moves both arms through the plugins for two seconds; returns what they said."""
-    robot = make_device(found[ROBOT].TrilatRobotConfig(**reach))
-    teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
+    """Moves both arms through the plugins for two seconds and returns the reported observations."""
+    robot = make_device(plugins[ROBOT].TrilatRobotConfig(**reach))
+    teleoperator = make_device(plugins[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
     robot.connect()
     teleoperator.connect()
     first, before = robot.get_observation(), teleoperator.get_teleop_events()
@@ -32,7 +34,7 @@ def drive(
             teleoperator.enable_torque()
         teleoperator.send_feedback(goal)
         wait_s(1.0 / 30.0)
-    told = {
+    observations = {
         "before": before,
         "after": teleoperator.get_teleop_events(),
         "observed": robot.get_observation(),
@@ -46,7 +48,7 @@ def drive(
     teleoperator.disconnect()
     robot.disconnect()
     assert not robot.is_connected
-    return told
+    return observations
 
 
 def assert_taken_over(seen: dict[str, Any], log: Log) -> None:

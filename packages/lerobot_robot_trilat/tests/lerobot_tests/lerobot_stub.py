@@ -1,7 +1,9 @@
-"""LeRobot's interfaces of robots and teleoperators as far as a plugin sees them, if it is not installed.
+"""Stand-ins for LeRobot's robot and teleoperator interfaces, used where LeRobot is not
+installed.
 
-By facts of its source, version 0.6: names of modules, of abstract methods, of events, and how a configuration
-is registered and its device found. Where LeRobot can be imported, the tests run against LeRobot.
+They reproduce the names of modules, abstract methods and events of LeRobot 0.6, and how LeRobot
+registers a configuration and finds its device. Where LeRobot can be imported, the tests run
+against LeRobot.
 """
 
 import abc
@@ -72,24 +74,24 @@ def _device(name: str) -> type:
 
 
 def _modules() -> dict[str, ModuleType]:
-    made = {
+    modules = {
         name: ModuleType(name) for name in ("lerobot", "lerobot.utils", "lerobot.utils.errors")
     }
     for room, name in (("robots", "Robot"), ("teleoperators", "Teleoperator")):
-        made[f"lerobot.{room}"] = ModuleType(f"lerobot.{room}")
-        made[f"lerobot.{room}"].__dict__.update(
+        modules[f"lerobot.{room}"] = ModuleType(f"lerobot.{room}")
+        modules[f"lerobot.{room}"].__dict__.update(
             {name: _device(name), f"{name}Config": _config()}
         )
-    made["lerobot.teleoperators.utils"] = ModuleType("lerobot.teleoperators.utils")
-    made["lerobot.teleoperators.utils"].__dict__["TeleopEvents"] = TeleopEvents
+    modules["lerobot.teleoperators.utils"] = ModuleType("lerobot.teleoperators.utils")
+    modules["lerobot.teleoperators.utils"].__dict__["TeleopEvents"] = TeleopEvents
     for error in ("DeviceNotConnectedError", "DeviceAlreadyConnectedError"):
-        made["lerobot.utils.errors"].__dict__[error] = type(error, (ConnectionError,), {})
-    return made
+        modules["lerobot.utils.errors"].__dict__[error] = type(error, (ConnectionError,), {})
+    return modules
 
 
 @contextmanager
 def plugins() -> Iterator[dict[str, ModuleType]]:
-    """Imports all plugins by the names of their folders, under LeRobot or in its place."""
+    """Imports all plugins by the names of their folders, with LeRobot or with the stand-ins."""
     before = dict(sys.modules)
     try:
         importlib.import_module("lerobot")
@@ -102,13 +104,17 @@ def plugins() -> Iterator[dict[str, ModuleType]]:
     finally:
         del sys.path[: len(names)]
         for name in [
-            one for one in sys.modules if one not in before and one.startswith("lerobot")
+            module
+            for module in sys.modules
+            if module not in before and module.startswith("lerobot")
         ]:
             del sys.modules[name]
 
 
 def make_device(config: Any) -> Any:
-    """Makes a device as LeRobot does: of its configuration's module, by its name without `Config`."""
+    """Makes a device as LeRobot does: from the module of its configuration, by the name without
+    `Config`.
+    """
     kind = type(config)
     return getattr(
         importlib.import_module(kind.__module__), kind.__name__.removesuffix("Config")

@@ -26,23 +26,25 @@ from .lerobot_stub import PLUGINS, make_device, plugins
 
 
 @pytest.fixture
-def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, ModuleType]]:
+def found_plugins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[dict[str, ModuleType]]:
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     with plugins() as modules:
         yield modules
 
 
-def test_a_plugin_is_found_by_the_name_of_its_distribution(
-    found: dict[str, ModuleType],
+def test_lerobot_finds_a_plugin_by_its_distribution_name(
+    found_plugins: dict[str, ModuleType],
 ) -> None:
-    """LeRobot imports the module of that name, which registers its configuration."""
-    assert sorted(found) == [ROBOT, TELEOPERATOR]
-    for folder, (name, module) in zip(PLUGINS, found.items(), strict=True):
+    """LeRobot imports the module of that name, and the module registers its configuration."""
+    assert sorted(found_plugins) == [ROBOT, TELEOPERATOR]
+    for folder, (name, module) in zip(PLUGINS, found_plugins.items(), strict=True):
         project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))
         assert project["project"]["name"] == module.__name__ == name
         assert project["tool"]["setuptools"]["py-modules"] == [name]
-    assert found[ROBOT].TrilatRobotConfig().type == "trilat"
-    assert found[TELEOPERATOR].TrilatTeleoperatorConfig().type == "trilat"
+    assert found_plugins[ROBOT].TrilatRobotConfig().type == "trilat"
+    assert found_plugins[TELEOPERATOR].TrilatTeleoperatorConfig().type == "trilat"
 
 
 def test_plugins_import_the_interface_alone() -> None:
@@ -58,9 +60,9 @@ def test_plugins_import_the_interface_alone() -> None:
 
 
 def test_features_follow_from_the_scenario_before_any_connection(
-    found: dict[str, ModuleType],
+    found_plugins: dict[str, ModuleType],
 ) -> None:
-    robot = make_device(found[ROBOT].TrilatRobotConfig())
+    robot = make_device(found_plugins[ROBOT].TrilatRobotConfig())
     joints = [
         f"{site}.{q}.{what}"
         for site in ("s", "m2")
@@ -69,7 +71,7 @@ def test_features_follow_from_the_scenario_before_any_connection(
     ]
     assert list(robot.observation_features) == [*joints, "x.pos", "y.pos", "x.felt", "y.felt"]
     assert robot.action_features == {"x.pos": float, "y.pos": float}
-    teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig())
+    teleoperator = make_device(found_plugins[TELEOPERATOR].TrilatTeleoperatorConfig())
     assert (
         teleoperator.action_features == teleoperator.feedback_features == robot.action_features
     )
@@ -78,9 +80,11 @@ def test_features_follow_from_the_scenario_before_any_connection(
         robot.get_observation()
 
 
-def test_robot_has_no_cameras_and_ends_with_its_session(found: dict[str, ModuleType]) -> None:
-    """`lerobot-record` counts the cameras, and disconnects only what is connected."""
-    robot = make_device(found[ROBOT].TrilatRobotConfig())
+def test_robot_has_no_cameras_and_ends_with_session(
+    found_plugins: dict[str, ModuleType],
+) -> None:
+    """`lerobot-record` counts the cameras and disconnects only connected devices."""
+    robot = make_device(found_plugins[ROBOT].TrilatRobotConfig())
     assert robot.cameras == {}
     closed: list[str] = []
     robot._stack.callback(closed.append, "closed")
@@ -102,15 +106,15 @@ SPACE = Path(__file__).parents[4] / "tests" / "presentation" / "cases" / "tool_d
 
 @pytest.mark.parametrize(("actions", "mode"), [("tip", "tip"), ("joints", "joint")])
 @pytest.mark.parametrize("space", [False, True])
-def test_a_dataset_has_the_actions_that_the_plugin_accepts(
-    found: dict[str, ModuleType], tmp_path: Path, actions: str, mode: str, space: bool
+def test_a_dataset_has_the_actions_the_plugin_accepts(
+    found_plugins: dict[str, ModuleType], tmp_path: Path, actions: str, mode: str, space: bool
 ) -> None:
-    """Names and order are the plugin's features, and the numbers where the hand of the user was."""
+    """Names and order are the plugin's features; the numbers are the position of the user's hand."""
     site, slave = ("m", "s") if space else ("m2", "s")
     hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
     scenario = load_scenario(str(SPACE) if space else "play", hands)
     (tmp_path / "held.toml").write_text(scenario.text, encoding="utf-8")
-    config = found[ROBOT].TrilatRobotConfig(
+    config = found_plugins[ROBOT].TrilatRobotConfig(
         scenario=str(tmp_path / "held.toml"), site=site, slave=slave
     )
     features = make_device(config).action_features
@@ -123,21 +127,23 @@ def test_a_dataset_has_the_actions_that_the_plugin_accepts(
     assert about["actions"] == actions
     frames = pl.read_parquet(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
     q = log[site].q[:: log[site].rate_hz // 100].tolist()
-    place = scenario.arms[site].end_effector if actions == "tip" else tuple
-    wanted = np.array([place(row) for row in q], dtype=np.float32)
+    hand_goal = scenario.arms[site].end_effector if actions == "tip" else tuple
+    wanted = np.array([hand_goal(row) for row in q], dtype=np.float32)
     assert frames[f"action.{site}"].to_numpy() == pytest.approx(wanted[: len(frames)], abs=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["tip", "joint", "force"])
 @pytest.mark.parametrize("space", [False, True])
 def test_a_dataset_has_the_observations_of_the_plugin(
-    found: dict[str, ModuleType], tmp_path: Path, mode: str, space: bool
+    found_plugins: dict[str, ModuleType], tmp_path: Path, mode: str, space: bool
 ) -> None:
     site = "m" if space else "m2"
     hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
     scenario = load_scenario(str(SPACE) if space else "play", hands)
     (tmp_path / "held.toml").write_text(scenario.text, encoding="utf-8")
-    config = found[ROBOT].TrilatRobotConfig(scenario=str(tmp_path / "held.toml"), site=site)
+    config = found_plugins[ROBOT].TrilatRobotConfig(
+        scenario=str(tmp_path / "held.toml"), site=site
+    )
     robot = make_device(config)
     settings = {"actions": "tip"} if mode == "force" else {}
     log = trilat_net.simulate(scenario)
@@ -153,12 +159,14 @@ def test_a_dataset_has_the_observations_of_the_plugin(
         assert info["features"]["action"]["names"] == list(robot.action_features)
 
 
-def test_a_policy_is_asked_at_its_rate_with_both_states(
-    found: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch
+def test_a_policy_gets_both_states_at_its_rate(
+    found_plugins: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Names of the dataset, the numbers of the robot in its order, and actions by their keys."""
+    """The names are the dataset's, the numbers the robot's in its own order, and actions go by
+    their keys.
+    """
     now_s = 0.0
-    sent, asked = list[Any](), list[float]()
+    sent, request_times_s = list[Any](), list[float]()
 
     def sleep(time_s: float) -> None:
         nonlocal now_s
@@ -166,38 +174,37 @@ def test_a_policy_is_asked_at_its_rate_with_both_states(
 
     def decide(state: dict[str, list[float]]) -> list[float]:
         nonlocal now_s
-        asked.append(now_s)
+        request_times_s.append(now_s)
         now_s += 0.01
         assert list(state) == ["observation.state", "observation.environment_state"]
         assert list(state.values()) == 2 * [[1.0, 2.0]]
         return [3.0, 4.0]
 
     clock = SimpleNamespace(sleep=sleep, monotonic=lambda: now_s)
-    monkeypatch.setattr(found[ROBOT], "time", clock)
+    monkeypatch.setattr(found_plugins[ROBOT], "time", clock)
     robot = SimpleNamespace(
         get_observation=lambda: {"b": 2, "a": 1},
         observation_features={"a": float, "b": float},
         action_features={"x.pos": float, "y.pos": float},
         send_action=sent.append,
     )
-    assert found[ROBOT].run_policy(robot, decide, 0.5, 10) == 5
-    assert asked == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert found_plugins[ROBOT].run_policy(robot, decide, 0.5, 10) == 5
+    assert request_times_s == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert sent == 5 * [{"x.pos": 3.0, "y.pos": 4.0}]
 
 
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
 def test_an_arm_that_nobody_can_hold_is_refused(
-    config: str, found: dict[str, ModuleType]
+    config: str, found_plugins: dict[str, ModuleType]
 ) -> None:
-    module = found[ROBOT if "Robot" in config else TELEOPERATOR]
+    module = found_plugins[ROBOT if "Robot" in config else TELEOPERATOR]
     with pytest.raises(ValueError, match="no operator of kind 'live' at m1"):
         make_device(getattr(module, config)(session="paper", site="m1"))
 
 
-def test_policy_and_person_share_a_slave_and_one_takes_over(
-    found: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_person_takes_over_from_a_policy(
+    found_plugins: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The policy moves m2 by 10 cm, the person takes over half-way, and feedback pulls the person's arm."""
     scenario = load_scenario("play", {"duration_s": 4.0, "rate_hz": 200})
     session, seen = Session.whole(scenario, tmp_path), dict[str, Any]()
 
@@ -215,9 +222,9 @@ def test_policy_and_person_share_a_slave_and_one_takes_over(
             trilat_net, "session", lambda *_, **__: reached(bus, clock), raising=False
         )
         relayed = SimpleNamespace(sleep=wait_s, monotonic=lambda: 1e-9 * clock.monotonic_ns())
-        monkeypatch.setattr(found[ROBOT], "time", relayed)
+        monkeypatch.setattr(found_plugins[ROBOT], "time", relayed)
         wait_s(1.0)
-        seen.update(drive(found, reached(bus, clock), wait_s))
+        seen.update(drive(found_plugins, reached(bus, clock), wait_s))
 
     session.stranger(act)
     log = session.run()
@@ -227,7 +234,7 @@ def test_policy_and_person_share_a_slave_and_one_takes_over(
 
 
 def assert_observed(observed: dict[str, float], log: Log, folder: Path) -> None:
-    """The dataset has a frame with what the plugin saw of each arm, and the policy is its program."""
+    """Asserts that a frame of the dataset has each arm's observation, with the policy as its program."""
     trilat_net.export(log, "lerobot", folder, observations="plugin", fps=200)
     frames = pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
     state = frames["observation.state"].to_numpy()

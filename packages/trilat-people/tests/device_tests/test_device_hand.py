@@ -1,4 +1,6 @@
-"""A device at an arm, in whole sessions on one clock: what moves the target, what is felt, who lets go."""
+"""A device at an arm, in whole sessions on one clock: the motion of the target, the rendered
+force, and the release.
+"""
 
 import math
 from collections.abc import Callable
@@ -10,6 +12,7 @@ import pytest
 from trilat_people.devices.haply_inverse3 import SILENCE_S
 
 from tests.documentation import find_blocks
+from tests.sites.devices import ZERO, ScriptedDevice
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import Session, reached
 from trilat_net.app.input_device import DeviceState
@@ -20,8 +23,6 @@ from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
-from .devices import ZERO, ScriptedDevice
-
 Script = Callable[[float], DeviceState]
 HELD = {"a": True, "b": False}
 FREE = {"a": False, "b": False}
@@ -30,7 +31,7 @@ SETTLED = 20
 
 
 class Led:
-    """A session of which a device leads m1: its log, the device, and what was said."""
+    """A session in which a device leads m1: its log, the device, and the printed texts."""
 
     def __init__(
         self,
@@ -57,7 +58,9 @@ class Led:
 
     @property
     def target(self) -> "np.ndarray[Any, np.dtype[np.float64]]":
-        """The target while somebody holds the arm, but for the first ticks, in which it finds its place."""
+        """Returns the target while the arm is held, without the first ticks, in which the
+        target finds its place.
+        """
         hand = self.log["m1"].hand
         return hand[hand[:, 2] > 0.0, 3:5][SETTLED:]
 
@@ -82,8 +85,10 @@ def up(t_s: float) -> tuple[float, float, float]:
     return 0.3, -0.12, 0.15 + 0.1 * min(max(t_s - 0.5, 0.0), 0.5)
 
 
-def test_device_leads_the_arm_and_the_log_repeats_it(tmp_path: Path) -> None:
-    """Up of whoever holds the device is y of a planar arm; where the device began does not matter."""
+def test_devices_lead_arms_as_logs_repeat(tmp_path: Path) -> None:
+    """Up in the frame of the device is y of a planar arm; the starting place of the device does
+    not matter.
+    """
     led = Led(tmp_path, moving(up, clutched))
     moved = led.target[-1] - led.target[0]
     assert moved == pytest.approx([0.0, 0.05], abs=1e-9)
@@ -99,15 +104,15 @@ def test_device_leads_the_arm_and_the_log_repeats_it(tmp_path: Path) -> None:
         (["left", "ahead"], 1.0, [0.0, 0.0]),
     ],
 )
-def test_frame_and_scale_turn_its_motion(
+def test_frame_and_scale_transform_its_motion(
     frame: list[str], scale: float, moved: list[float], tmp_path: Path
 ) -> None:
     led = Led(tmp_path, moving(up, clutched), {"frame": frame, "scale": scale})
     assert led.target[-1] - led.target[0] == pytest.approx(moved, abs=1e-9)
 
 
-def test_open_clutch_moves_nothing_and_closing_it_makes_no_jump(tmp_path: Path) -> None:
-    """The device goes up by 50 mm with the clutch open; the arm stays held where it was."""
+def test_closing_a_clutch_makes_no_jump(tmp_path: Path) -> None:
+    """The device goes up by 50 mm with the clutch open; the arm stays held at its place."""
     led = Led(tmp_path, moving(up, lambda t_s: 0.2 <= t_s < 0.4 or t_s > 1.5))
     assert np.abs(led.target - led.target[0]).max() < 1e-12
     assert led.changes == ["m1: ScriptedDevice takes hold"]  # held to the end
@@ -115,7 +120,7 @@ def test_open_clutch_moves_nothing_and_closing_it_makes_no_jump(tmp_path: Path) 
     assert open_s == []
 
 
-def test_button_lets_go(tmp_path: Path) -> None:
+def test_the_button_lets_go(tmp_path: Path) -> None:
     def script(t_s: float) -> DeviceState:
         return DeviceState(
             up(t_s), ZERO, {"a": t_s < 2.0, "b": 1.0 < t_s < 1.1} if t_s > 0.2 else FREE
@@ -128,7 +133,7 @@ def test_button_lets_go(tmp_path: Path) -> None:
 
 
 def jumping(wrong: DeviceState) -> Script:
-    """Reports something else for three states while it moves up."""
+    """Reports a jump or an invalid number for three states while it moves up."""
     return lambda t_s: (
         wrong if 0.7 <= t_s < 0.715 else DeviceState(up(t_s), ZERO, HELD if t_s > 0.2 else FREE)
     )
@@ -147,10 +152,10 @@ def jumping(wrong: DeviceState) -> Script:
         ),
     ],
 )
-def test_jumps_and_numbers_that_are_none_move_nothing(
+def test_jumps_and_invalid_numbers_move_nothing(
     wrong: DeviceState, counted: str, tmp_path: Path
 ) -> None:
-    """The target misses what the device moved meanwhile at most, 2 mm, and stands still at the end."""
+    """The target misses at most the motion of the device meanwhile, 2 mm, and stands still at the end."""
     led = Led(tmp_path, jumping(wrong))
     moved = led.target[-1] - led.target[0]
     assert moved == pytest.approx([0.0, 0.05], abs=2.1e-3)
@@ -159,11 +164,11 @@ def test_jumps_and_numbers_that_are_none_move_nothing(
 
 
 def felt(led: Led) -> "np.ndarray[Any, np.dtype[np.float64]]":
-    """The largest force that the device rendered, and the last ones, N."""
+    """Returns the largest force that the device rendered, and the last forces, N."""
     return np.array([force for _, force in led.device.rendered])
 
 
-def test_device_renders_the_reaction_of_the_arm(tmp_path: Path) -> None:
+def test_devices_render_the_arms_reaction(tmp_path: Path) -> None:
     """Where the hand pulls the arm up, the device pulls down, by the record's force, and not ahead."""
     led = Led(tmp_path, moving(up, clutched), {"force_limit_n": 1000.0})
     rendered = felt(led)
@@ -184,8 +189,8 @@ def test_force_stays_within_its_limit(scale: float, limit: float, tmp_path: Path
     assert np.linalg.norm(felt(led), axis=1).max() == pytest.approx(limit)
 
 
-def test_clutch_that_closes_lets_the_force_grow(tmp_path: Path) -> None:
-    """The arm is pulled by a target 50 mm off all the time: nothing is felt at once."""
+def test_closing_clutches_let_the_force_grow(tmp_path: Path) -> None:
+    """A target 50 mm off pulls the arm all the time: no force is felt at once."""
     led = Led(
         tmp_path,
         moving(up, lambda t_s: 0.2 <= t_s < 1.0 or t_s > 1.2),
@@ -197,8 +202,10 @@ def test_clutch_that_closes_lets_the_force_grow(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["raises", "hangs"])
-def test_silent_device_lets_go_and_needs_its_button_anew(how: str, tmp_path: Path) -> None:
-    """It is away from 1 s to 1.5 s with its clutch pressed, which is let go at 2 s and pressed at 2.2 s."""
+def test_silent_devices_need_their_button_anew(how: str, tmp_path: Path) -> None:
+    """The device is away from 1 s to 1.5 s with its clutch pressed; the clutch is released at 2
+    s and pressed at 2.2 s.
+    """
 
     def script(t_s: float) -> DeviceState:
         if 1.0 <= t_s < 1.5 and how == "raises":
@@ -222,7 +229,7 @@ def test_silent_device_lets_go_and_needs_its_button_anew(how: str, tmp_path: Pat
         assert led.device.entered == 2
 
 
-def test_lost_device_is_said_once_and_tried_again(tmp_path: Path) -> None:
+def test_lost_devices_are_reported_and_tried_again(tmp_path: Path) -> None:
     def script(_: float) -> DeviceState:
         raise ConnectionError("no service")
 
@@ -234,7 +241,7 @@ def test_lost_device_is_said_once_and_tried_again(tmp_path: Path) -> None:
     assert led.changes == []
 
 
-def test_record_that_is_old_is_felt_no_more(tmp_path: Path) -> None:
+def test_old_records_are_not_felt(tmp_path: Path) -> None:
     """A site that stalls sends nothing: after 0.1 s the device is free."""
     scenario = load_scenario("play", {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 10})
     session, devices = Session.whole(scenario, tmp_path), list[ScriptedDevice]()
@@ -252,8 +259,10 @@ def test_record_that_is_old_is_felt_no_more(tmp_path: Path) -> None:
     assert 20 < stale.size < 80
 
 
-def test_device_of_the_page_leads_an_arm(tmp_path: Path) -> None:
-    """The class of docs/sessions/devices.md, which moves to the right at 5 cm/s and presses its clutch after 1 cm."""
+def test_the_documented_device_leads_an_arm(tmp_path: Path) -> None:
+    """The class of docs/sessions/devices.md, which moves to the right at 5 cm/s and presses its
+    clutch after 1 cm.
+    """
     names: dict[str, Any] = {}
     (code,) = [
         block.text
@@ -277,17 +286,17 @@ def test_device_of_the_page_leads_an_arm(tmp_path: Path) -> None:
     assert min(felt_n) < -0.1
 
 
-def test_hand_that_is_not_led_by_its_tip_is_refused(tmp_path: Path) -> None:
+def test_hands_not_led_by_tips_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="mode 'tip'"):
         Led(tmp_path, moving(up, clutched), mode="joint")
 
 
-def test_a_service_is_given_up_before_a_hand_is_silent() -> None:
+def test_services_are_given_up_before_hand_silence() -> None:
     assert SILENCE_S * 1e9 < SILENCE_NS
 
 
 def pumped(t_s: float) -> DeviceState:
-    """Moves right by 0.3 m with the clutch pressed, back with it open, five times in 2 s; then left."""
+    """Moves right by 0.3 m with the clutch pressed, back with it open, five times in 2 s; then leaves."""
     phase = min(t_s, 2.2) % 0.4
     back = max(t_s - 2.2, 0.0)
     if t_s < 0.2:
@@ -320,7 +329,7 @@ LATER = [pytest.param(gaps, marks=pytest.mark.long) for gaps in ((150, 10), (30,
 
 @pytest.mark.parametrize("gaps_ms", [(60, 10), *LATER], ids=str)
 def test_uneven_states_never_jerk_the_target(gaps_ms: tuple[int, int], tmp_path: Path) -> None:
-    """A hand at 0.3 m/s whose machine hands its places over in bursts: 37 N m within 1 ms before."""
+    """A hand at 0.3 m/s whose machine delivers its places in bursts: 37 N m within 1 ms before."""
 
     def place(t_s: float) -> tuple[float, float, float]:
         late, even = (1e-3 * gap for gap in gaps_ms)

@@ -1,4 +1,4 @@
-"""Devices, each against a stand-in that speaks as it does: one contract, and what is its own."""
+"""Devices, each against a stand-in with its protocol: the common contract, and the features of each."""
 
 import json
 import math
@@ -14,10 +14,9 @@ from trilat_people.devices.spacemouse import SpaceMouse, find_spacemouse
 from tests.cli.running import trilat
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
+from tests.sites.devices import ZERO, CapReports, HaplyService
 from trilat_net.app.input_device import Device, DeviceState
 from trilat_net.errors import UsageError
-
-from .devices import ZERO, CapReports, HaplyService
 
 FORCE = (0.5, -1.0, 1.5)
 
@@ -39,7 +38,7 @@ def cap() -> Iterator[CapReports]:
 def there(
     request: pytest.FixtureRequest, service: HaplyService, cap: CapReports
 ) -> tuple[Device, Callable[[], None]]:
-    """A device by its name and address, and what takes it away."""
+    """Returns a device by its name and address, and a function that removes the device."""
     address, lose = {
         "haply_inverse3": (service.address, service.kill),
         "spacemouse": (cap.path, cap.unplug),
@@ -63,10 +62,10 @@ def test_device_reads_renders_and_is_entered_again(
                 device.render(FORCE)
 
 
-def test_device_that_is_lost_raises_an_error_of_the_system(
+def test_lost_devices_raise_a_system_error(
     there: tuple[Device, Callable[[], None]],
 ) -> None:
-    """And again where it is entered, if it is not there."""
+    """And again when an absent device is entered."""
     device, lose = there
     with device:
         device.read()
@@ -82,12 +81,12 @@ def lasts(device: Device) -> None:
         device.read()
 
 
-def test_device_is_one_of_those_that_there_are() -> None:
+def test_devices_are_known_by_name() -> None:
     with pytest.raises(UsageError, match="one of haply_inverse3, spacemouse"):
         open_device("phantom")
 
 
-def test_command_says_what_it_lacks(tmp_path: Path) -> None:
+def test_the_command_names_its_missing_device(tmp_path: Path) -> None:
     for words, problem in (
         (("--session", "play"), "needs --scenario"),
         (("--session", "play", "--device", "spacemouse", "--set", "seed=2"), "leave out --set"),
@@ -99,7 +98,7 @@ def test_command_says_what_it_lacks(tmp_path: Path) -> None:
 # --- Haply's Inverse3 -------------------------------------------------------------------------------------
 
 
-def test_every_state_is_asked_for_by_a_force(service: HaplyService) -> None:
+def test_every_state_follows_a_force(service: HaplyService) -> None:
     """The first message names the program; all others hold nothing but the force."""
     with HaplyInverse3(service.address) as device:
         for n in range(4):
@@ -115,7 +114,7 @@ def test_every_state_is_asked_for_by_a_force(service: HaplyService) -> None:
 
 
 @pytest.mark.parametrize("key", ["vector", "values"])
-def test_force_is_sent_by_the_key_that_the_service_knows(key: str) -> None:
+def test_force_uses_the_services_own_key(key: str) -> None:
     with HaplyService(force_key=key) as service:
         way = "#values" if key == "values" else ""
         with HaplyInverse3(service.address + way) as device:
@@ -187,8 +186,8 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize("text", MALFORMED, ids=range(len(MALFORMED)))
-def test_message_that_cannot_be_read_is_nowhere(text: str, service: HaplyService) -> None:
-    """The next one is asked for all the same."""
+def test_an_unreadable_message_gives_no_place(text: str, service: HaplyService) -> None:
+    """The next message is requested all the same."""
     with HaplyInverse3(service.address) as device:
         device.read()
         service.raw = text
@@ -202,7 +201,7 @@ def test_message_that_cannot_be_read_is_nowhere(text: str, service: HaplyService
 # --- SpaceMouse -------------------------------------------------------------------------------------------
 
 
-def test_cap_pushed_all_the_way_moves_at_its_speed(cap: CapReports) -> None:
+def test_a_pushed_cap_moves_at_its_speed(cap: CapReports) -> None:
     """To the right, ahead and up, of a cap that reports near and down; half a second of reports."""
     clock = ManualClock()
     with SpaceMouse(cap.path, clock) as device:
@@ -215,7 +214,7 @@ def test_cap_pushed_all_the_way_moves_at_its_speed(cap: CapReports) -> None:
 
 
 def test_silent_cap_is_at_rest(cap: CapReports) -> None:
-    """A cap that is pushed reports all the time: one whose radio is gone does not."""
+    """A pushed cap reports all the time, but a cap whose radio is gone does not."""
     clock = ManualClock()
     with SpaceMouse(cap.path, clock) as device:
         cap.push(350, 0, 0)

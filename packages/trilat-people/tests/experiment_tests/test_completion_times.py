@@ -87,7 +87,7 @@ def test_rows_of_a_csv_file_say_the_same() -> None:
 
 
 @given(st.lists(st.floats(0.1, 40.0), min_size=6, max_size=30))
-def test_an_interval_of_a_median_is_that_of_scipy(times_s: list[float]) -> None:
+def test_median_intervals_are_those_of_scipy(times_s: list[float]) -> None:
     found = find_median_interval(times_s)
     assert found is not None
     expected = stats.quantile_test(times_s, q=1.0, p=0.5).confidence_interval(0.95)

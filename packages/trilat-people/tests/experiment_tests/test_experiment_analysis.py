@@ -10,10 +10,9 @@ import pytest
 from trilat_people.experiment.experiment_run import begin_experiment
 
 import trilat_net as tn
+from tests.experiments import REACH, answer_form, write_hurried_pair, write_protocol
 from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
-
-from .experiments import REACH, answer_form, write_hurried_pair, write_protocol
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def test_means_are_those_of_the_table(folder: Path) -> None:
     assert [one.condition for one in found.means["completion_s"]] == ["near", "far"]
 
 
-def test_everything_is_written_and_named(folder: Path, tmp_path: Path) -> None:
+def test_every_result_is_written_and_named(folder: Path, tmp_path: Path) -> None:
     found = tn.analyse_experiment(folder, tmp_path / "there")
     assert all(path.exists() for path in found.paths)
     assert (tmp_path / "there" / "completion_s.png").read_bytes().startswith(b"\x89PNG")
@@ -71,7 +70,7 @@ def test_methods_paragraph_has_delays_as_measured(folder: Path) -> None:
     assert found.methods in found.summary()
 
 
-def test_who_is_excluded_is_said_with_the_reason(folder: Path, tmp_path: Path) -> None:
+def test_excluded_participants_are_named_with_the_reason(folder: Path, tmp_path: Path) -> None:
     found = tn.analyse_experiment(
         folder, tmp_path / "there", exclude={"P2": "stopped in block 2"}
     )
@@ -176,13 +175,13 @@ def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path
     assert values.count("") == 7
 
 
-def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:
+def test_an_empty_analysis_is_reported(tmp_path: Path) -> None:
     begun = begin_experiment(write_protocol(tmp_path), tmp_path / "out")
     with pytest.raises(UsageError, match="there are no trials to analyse yet"):
         tn.analyse_experiment(begun.folder)
 
 
-def test_power_by_theory_lies_in_the_interval_of_drawn_experiments() -> None:
+def test_theoretical_power_matches_drawn_experiments() -> None:
     """G*Power 3.1: d_z = 0.8, two-sided, alpha 0.05 asks for 15 participants for a power of 0.8."""
     found = tn.compute_experiment_power(0.8, 16)
     assert found.least[0.8] == 15

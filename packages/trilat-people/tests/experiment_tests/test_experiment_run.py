@@ -20,10 +20,9 @@ from trilat_people.experiment.experiment_run import (
 from trilat_people.experiment.tasks import place_slave
 
 import trilat_net as tn
+from tests.experiments import REACH, TRACK, write_protocol
 from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
-
-from .experiments import REACH, TRACK, write_protocol
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,7 @@ def test_path_of_a_circle() -> None:
     assert path_length_m(places) == pytest.approx(0.6 * np.pi, rel=1e-5)
 
 
-def test_work_of_force_on_a_mass_is_its_kinetic_energy() -> None:
+def test_force_work_is_a_masss_kinetic_energy() -> None:
     t_s = np.arange(0.0, 1.0, 1e-3)
     velocity = np.column_stack([np.sin(3.0 * t_s), t_s**2])
     force = 2.0 * np.column_stack([3.0 * np.cos(3.0 * t_s), 2.0 * t_s])

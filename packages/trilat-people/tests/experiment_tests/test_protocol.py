@@ -103,7 +103,7 @@ def test_pairs_hold_two_masters() -> None:
     ]
 
 
-def test_digest_knows_what_was_planned() -> None:
+def test_the_digest_covers_the_plan() -> None:
     first = plan_experiment(make_protocol()).digest
     assert plan_experiment(make_protocol()).digest == first
     assert plan_experiment(make_protocol(seed=2)).digest != first
@@ -192,9 +192,7 @@ def test_digest_knows_what_was_planned() -> None:
         ),
     ],
 )
-def test_all_that_is_wrong_is_named_before_anybody_sits_down(
-    keys: dict[str, Any], problem: str
-) -> None:
+def test_all_mistakes_are_named_before_the_start(keys: dict[str, Any], problem: str) -> None:
     with pytest.raises(UsageError, match=problem):
         plan_experiment(make_protocol(**keys))
 
@@ -232,7 +230,7 @@ def test_template_is_a_protocol(tmp_path: Path) -> None:
     assert plan.to_dict()["counted"] == 12 * 4 * 4
 
 
-def test_catch_trials_are_a_share_of_every_other_block() -> None:
+def test_catch_trials_share_every_other_block() -> None:
     plan = plan_experiment(
         make_protocol(trials=10, practice=2, catch={"condition": "near", "share": 0.2})
     )

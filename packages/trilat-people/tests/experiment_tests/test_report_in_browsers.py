@@ -6,10 +6,9 @@ import pytest
 from playwright.sync_api import Browser
 
 import trilat_net
+from tests.experiments import REACH, write_protocol
 from tests.live.browsers import needs_browser
 from tests.page.study_pages import assert_markdown_is_whole, assert_page_of_study_is_whole
-
-from .experiments import REACH, write_protocol
 
 pytestmark = needs_browser
 

@@ -12,9 +12,8 @@ from trilat_people.experiment.experiment_run import Experiment, begin_experiment
 from trilat_people.experiment.staircase import Staircase
 
 import trilat_net as tn
+from tests.experiments import write_protocol
 from trilat_net.errors import UsageError
-
-from .experiments import write_protocol
 
 SHORT = 'kind = "track"\nduration_s = 0.2'
 STAIRS = '\n[staircase]\nkey = "control.K"\nstandard = 100.0\nstart = 80.0\n'
@@ -29,7 +28,7 @@ def write_stairs(folder: Path, trials: int, more: str = "") -> Path:
     return file
 
 
-def test_difference_falls_after_two_right_and_rises_after_wrong() -> None:
+def test_differences_follow_the_two_right_rule() -> None:
     stairs = Staircase("link.delay_ms", 80.0, factor=2.0)
     right = [True, True, True, False, True, True, True, True, False, False, True, True]
     found = stairs.list_differences(right)
@@ -55,7 +54,7 @@ def test_difference_falls_after_two_right_and_rises_after_wrong() -> None:
 
 
 @pytest.mark.parametrize("down", [1, 2, 3])
-def test_it_settles_where_levitt_says(down: int) -> None:
+def test_staircases_settle_at_levitts_point(down: int) -> None:
     """At the difference that a participant tells right with probability 0.5^(1 / down), by SciPy's normal."""
     stairs = Staircase("link.delay_ms", 100.0, factor=1.2, down=down, deviation=10.0)
     found = []
@@ -134,7 +133,7 @@ def test_choices_and_threshold_are_in_the_tables(done: Experiment) -> None:
     assert "70.7 % right" in analysis.methods
 
 
-def test_run_again_is_the_same_and_asks_nothing_twice(done: Experiment) -> None:
+def test_reruns_are_equal_and_ask_nothing_twice(done: Experiment) -> None:
     before = {path: path.read_bytes() for path in done.folder.rglob("*.*") if path.is_file()}
     tn.run_experiment(done.folder, jobs=1)
     assert {path: path.read_bytes() for path in before} == before

@@ -95,7 +95,7 @@ def test_more_trials_are_not_more_participants() -> None:
     assert once[0].p == pytest.approx(often[0].p)
 
 
-def test_what_a_pair_shares_is_counted_once() -> None:
+def test_shared_variance_of_pairs_counts_once() -> None:
     rows = [{**row, "pair": row["participant"] // 2} for row in draw(1, 12, [0.0, 1.0])]
     (users,), (pairs,) = (
         compare_conditions(rows, "time_s", unit=u) for u in ("participant", "pair")
@@ -104,7 +104,7 @@ def test_what_a_pair_shares_is_counted_once() -> None:
     assert users.difference == pytest.approx(pairs.difference)
 
 
-def test_participant_without_a_condition_is_left_out_of_it() -> None:
+def test_incomplete_participants_are_left_out() -> None:
     rows = draw(2, 8, [0.0, 1.0, 2.0])
     kept = [row for row in rows if row["condition"] != "c2" or row["participant"] != 3]
     empty = [{**row, "time_s": ""} if row not in kept else row for row in rows]
@@ -117,7 +117,7 @@ def test_participant_without_a_condition_is_left_out_of_it() -> None:
     assert found == compare_conditions(texts, "time_s")
 
 
-def test_what_numbers_cannot_tell_is_none() -> None:
+def test_undecidable_numbers_are_none() -> None:
     (alone,) = compare_conditions(tidy({"a": [1.0], "b": [3.0]}), "time_s")
     assert (alone.difference, alone.p, alone.interval, alone.d_z) == (2.0, None, None, None)
     (same,) = compare_conditions(tidy({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.5, 0.6]}), "time_s")
@@ -129,7 +129,7 @@ def test_what_numbers_cannot_tell_is_none() -> None:
     assert (none.number, none.difference) == (0, None)
 
 
-def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
+def test_untidy_rows_name_what_is_missing() -> None:
     with pytest.raises(UsageError, match="a row lacks condition"):
         average_trials([{"participant": 1, "time_s": 2.0}], "time_s")
     with pytest.raises(
@@ -147,7 +147,7 @@ def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
 # --- intervals -------------------------------------------------------------------------------------------
 
 
-def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
+def test_condition_intervals_are_student_and_bootstrap() -> None:
     first, second = summarise_conditions(tidy(SLEEP), "time_s")
     assert (first.condition, first.number, first.mean) == ("first", 10, pytest.approx(0.75))
     expected = stats.t.interval(0.95, 9, loc=0.75, scale=stats.sem(SLEEP["first"]))
@@ -160,7 +160,7 @@ def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
     assert alone == ("a", 1, 2.0, None, None, None, 0)
 
 
-def test_bootstrap_is_a_function_of_its_seed_and_follows_asymmetry() -> None:
+def test_bootstrap_follows_seed_and_asymmetry() -> None:
     times_s = np.exp(np.random.default_rng(5).normal(0.0, 1.0, 25)).tolist()
     low, high = bootstrap_interval(times_s, 7)
     assert (low, high) == bootstrap_interval(times_s, 7) != bootstrap_interval(times_s, 8)
@@ -169,7 +169,7 @@ def test_bootstrap_is_a_function_of_its_seed_and_follows_asymmetry() -> None:
     assert bootstrap_interval([2.0]) is None
 
 
-def test_bootstrap_holds_the_truth_about_as_often_as_it_says() -> None:
+def test_bootstrap_covers_the_truth_as_stated() -> None:
     draws = np.random.default_rng(11).normal(3.0, 1.0, (120, 20))
     intervals = [bootstrap_interval(row.tolist()) for row in draws]
     assert np.mean([low <= 3.0 <= high for low, high in intervals]) > 0.87
@@ -199,7 +199,7 @@ def test_balanced_mixed_model_is_the_paired_t_test(seed: int, of_pair: float) ->
 
 
 @pytest.mark.usefixtures("statsmodels")
-def test_mixed_model_of_three_conditions_is_the_analysis_of_variance() -> None:
+def test_mixed_model_of_three_equals_anova() -> None:
     rows = draw(4, 16, [0.0, 0.5, 1.0], of_pair=1.5)
     model = fit_mixed_model(rows, "time_s")
     table = np.array([list(each.values()) for each in average_trials(rows, "time_s").values()])
@@ -314,7 +314,7 @@ def test_correction_costs_power_and_keeps_its_order() -> None:
     assert found[0].found_holm < 0.1 < 0.5 < found[1].found_holm
 
 
-def test_without_effect_p_is_uniform_and_families_keep_alpha() -> None:
+def test_without_effect_families_keep_alpha() -> None:
     runs = [
         compare_conditions(draw(seed, 10, [0.0, 0.0, 0.0]), "time_s") for seed in range(300)
     ]
@@ -375,7 +375,7 @@ def test_methods_paragraph_has_every_number_it_was_given() -> None:
         assert words in text
 
 
-def test_methods_paragraph_leaves_out_what_is_not_given() -> None:
+def test_methods_paragraph_omits_missing_facts() -> None:
     text = write_methods(
         {k: v for k, v in FACTS.items() if k not in ("pairs", "blocks", "exclusions", "alpha")}
     )
@@ -392,7 +392,7 @@ def test_methods_paragraph_leaves_out_what_is_not_given() -> None:
         ({"conditions": {"near": {"loss_percent": 1}}}, "condition near has no delay"),
     ],
 )
-def test_methods_paragraph_refuses_what_a_referee_would_ask(
+def test_methods_paragraph_refuses_incomplete_studies(
     changed: dict[str, Any], says: str
 ) -> None:
     facts = {key: value for key, value in {**FACTS, **changed}.items() if value is not None}

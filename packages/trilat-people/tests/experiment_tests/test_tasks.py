@@ -12,11 +12,10 @@ from trilat_people.experiment.tasks import ContactTrial, ReachTrial, TrackTrial
 from trilat_people.experiment.trial_run import ExperimentTrial, TrialJudge
 
 import trilat_net as tn
+from tests.experiments import APART, CONTACT, HANDOVER, REACH, TRACK, write_protocol
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-
-from .experiments import APART, CONTACT, HANDOVER, REACH, TRACK, write_protocol
 
 PAIR = '["m1", "m2"]'
 TRAINING = """
@@ -57,7 +56,7 @@ def find_end_s(done: Experiment, row: dict[str, Any]) -> float:
     )
 
 
-def test_force_at_a_wall_is_held_for_the_dwell(tmp_path: Path) -> None:
+def test_wall_force_is_held_for_the_dwell(tmp_path: Path) -> None:
     """By the depth in the wall, 1000 N/m, of the slave: not by the torques that the judge looks at."""
     done, rows = run(tmp_path, '["m1"]', CONTACT)
     for row, log in zip(rows, open_logs(done), strict=True):
@@ -70,7 +69,7 @@ def test_force_at_a_wall_is_held_for_the_dwell(tmp_path: Path) -> None:
         assert row["work_j"] > 0.0
 
 
-def test_who_leaves_the_corridor_has_failed_at_once(tmp_path: Path) -> None:
+def test_leaving_the_corridor_fails_at_once(tmp_path: Path) -> None:
     done, rows = run(tmp_path, PAIR, f"{REACH}\ncorridor_m = 0.012")
     assert any(not row["succeeded"] for row in rows)
     for row, log in zip(rows, open_logs(done), strict=True):
@@ -144,7 +143,7 @@ def test_authority_moves_from_the_expert_trial_by_trial(tmp_path: Path) -> None:
         assert trial.make_goal().has_authority(5.0, 0) == (one.phase == "training")
 
 
-def test_what_was_learnt_is_before_less_after(tmp_path: Path) -> None:
+def test_learning_is_before_less_after(tmp_path: Path) -> None:
     done, rows = run(tmp_path, PAIR, TRACK, TRAINING)
     found = tn.analyse_experiment(done.folder)
     phases = defaultdict(list)
@@ -181,7 +180,7 @@ def test_a_force_counts_only_while_it_is_held() -> None:
     assert goal.judge(2.0, at, 0.0) == (False, 2.0)
 
 
-def test_force_at_the_slave_is_that_of_the_wall(tmp_path: Path) -> None:
+def test_slave_force_equals_the_walls(tmp_path: Path) -> None:
     plan = tn.check_experiment(write_protocol(tmp_path, '["m1"]', CONTACT))
     scenario = plan.scenarios["near"]
     q, force = np.array([[0.3, 0.9]]), np.array([3.0, -4.0])

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from device_tests.devices import HaplyService, Vector
 
 from tests.live.processes import PAPER, Process, Session, Stage, connections
 from tests.net.waiting import until
+from tests.sites.devices import HaplyService, Vector
 from trilat_net.log.log_reader import Log
 
 HANDS = 'sites.m1.hands=[{kind="live", device={force_limit_n=1.5}}]'
@@ -79,7 +79,7 @@ def last_moved(log: Log) -> tuple[float, float]:
 
 
 @pytest.mark.long
-def test_a_haply_leads_an_arm_and_renders_its_reaction(held: Held) -> None:
+def test_a_haply_leads_and_renders_its_reaction(held: Held) -> None:
     """The target turns as the device does, and the service got the reaction of the arm, within its limit."""
     held.service.presses_anew = True  # a busy machine may be silent, and let go, in between
     held.circles()
@@ -111,7 +111,7 @@ def test_a_haply_leads_an_arm_and_renders_its_reaction(held: Held) -> None:
 
 
 @pytest.mark.long
-def test_silent_haply_lets_go_and_needs_its_button_anew(held: Held) -> None:
+def test_silent_haply_lets_go_until_its_button(held: Held) -> None:
     """150 ms after the last state of the service the program lets go."""
     held.circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
@@ -128,7 +128,7 @@ def test_silent_haply_lets_go_and_needs_its_button_anew(held: Held) -> None:
 
 
 @pytest.mark.long
-def test_killed_service_lets_go_and_leads_again_once_back(held: Held) -> None:
+def test_a_killed_service_leads_again_after_return(held: Held) -> None:
     held.circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.service.kill()
@@ -147,7 +147,7 @@ def test_killed_service_lets_go_and_leads_again_once_back(held: Held) -> None:
 
 
 @pytest.mark.long
-def test_killed_program_of_a_device_lets_go(held: Held) -> None:
+def test_a_killed_device_program_lets_go(held: Held) -> None:
     """It has no heartbeat but the states of its device: the site hears it no more."""
     held.circles()
     until(lambda: len(held.service.asked) > 500, 60.0)

@@ -92,7 +92,7 @@ def assert_log_table_and_page_agree(
 
 @pytest.mark.long
 @pytest.mark.parametrize("trials", [3, 10])
-def test_two_people_reach_together_and_logs_say_so(trials: int, stage: Stage) -> None:
+def test_two_people_reach_together_as_logged(trials: int, stage: Stage) -> None:
     """Two browsers, two roles, real pointers: boundaries and measures are those of verified logs."""
     folder, conditions = stage.folder / "out", FAR if trials % 2 == 0 else ""
     count = trials // (2 if conditions else 1)
@@ -134,7 +134,7 @@ TASKS = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("what", TASKS)
-def test_two_people_do_what_else_a_task_asks(what: str, stage: Stage) -> None:
+def test_two_people_perform_other_tasks(what: str, stage: Stage) -> None:
     """They are told, it is drawn, and the table has its measure; the log verifies."""
     task, measure = TASKS[what]
     folder, pictures = stage.folder / "out", os.environ.get("TRILAT_PICTURES")
@@ -159,7 +159,7 @@ def test_two_people_do_what_else_a_task_asks(what: str, stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
+def test_a_killed_experiment_with_people_resumes_whole(stage: Stage) -> None:
     """SIGKILL within a trial and between two, a page reloaded within one: nothing twice, nothing lost."""
     folder = stage.folder / "out"
     first = begin(stage, write_protocol(stage.folder, 2, CONSENT), "--out", str(folder))
@@ -195,7 +195,7 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_trial_that_somebody_stops_is_made_again(stage: Stage) -> None:
+def test_a_stopped_trial_is_repeated(stage: Stage) -> None:
     """A user stops one, closes the page in another; a second page of the role only watches."""
     folder = stage.folder / "out"
     # nobody dwells so long that a trial succeeds before it is stopped
@@ -225,7 +225,7 @@ def test_trial_that_somebody_stops_is_made_again(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_experimenter_ends_it_for_now_and_it_goes_on(stage: Stage) -> None:
+def test_experimenters_may_interrupt_and_resume(stage: Stage) -> None:
     folder = stage.folder / "out"
     running = begin(stage, write_protocol(stage.folder, 2), "--out", str(folder))
     with participants(running) as people:

@@ -140,7 +140,7 @@ def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_lost_controller_lets_go_and_a_button_stops_all(stage: Stage) -> None:
+def test_lost_controllers_let_go_and_buttons_stop(stage: Stage) -> None:
     """On the page of a user, whose controllers both lead its own arm."""
     running = served(stage)
     link = role_address(running, "user m1")

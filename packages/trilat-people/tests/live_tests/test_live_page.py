@@ -74,7 +74,7 @@ def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float
     return np.column_stack([part.t_s, part.hand[:, 0], part.hand[:, 1]])
 
 
-def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
+def test_people_see_hold_change_and_end_sessions(stage: Stage) -> None:
     # drawing takes what a machine of two cores has
     running = live(stage, "play", "--set", "rate_hz=100")
     with browser_page(page_address(running)) as page:
@@ -252,7 +252,7 @@ pad.vibrationActuator = { playEffect: (kind, how) => {
 
 
 @pytest.mark.long
-def test_a_gamepad_rumbles_as_its_arm_meets_the_wall(stage: Stage) -> None:
+def test_gamepads_rumble_as_arms_meet_walls(stage: Stage) -> None:
     """Ten times a second at most, as strong as the wall pushes; not before, and not once it is let go."""
     running = live(stage, "play", "--set", "rate_hz=250")
     with browser_page(page_address(running)) as page:
@@ -281,7 +281,7 @@ def test_a_gamepad_rumbles_as_its_arm_meets_the_wall(stage: Stage) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("killed", ["browser", "server"])
-def test_an_arm_in_grip_is_free_after_its_page_dies(killed: str, stage: Stage) -> None:
+def test_arms_are_free_after_their_page_dies(killed: str, stage: Stage) -> None:
     """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
     session = Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=250")
     session.all()
@@ -387,7 +387,7 @@ card.numbers({ ...trilat.frame.sites[card.name], e: 100, tau: large, pull: large
 
 
 @pytest.mark.long
-def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
+def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
     glide = ("rate_hz=250", "on_stale.action=glide", "on_stale.align_limit_rad=3")
     options = chain.from_iterable(("--set", one) for one in glide)
     running = live(stage, "two_sites", "--duration", "60", *options)
@@ -478,7 +478,7 @@ def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
     running.prints("checking the log")
 
 
-def test_a_browser_gets_in_by_the_token_of_its_link() -> None:
+def test_browsers_get_in_by_their_links_token() -> None:
     """It stands in the fragment, which the page hands to its socket; a wrong one is said."""
     said: list[str] = []
     options = PageOptions(host="0.0.0.0", insecure=True)

@@ -129,7 +129,7 @@ def answer_to(address: str, request: bytes) -> bytes:
     [(60, 12), pytest.param(3000, 300, marks=pytest.mark.long)],
     ids=["light", "whole"],
 )
-def test_whatever_a_page_sends_ends_no_server(count: int, raw: int, stage: Stage) -> None:
+def test_no_page_message_ends_the_server(count: int, raw: int, stage: Stage) -> None:
     rare = ("--set", "rate_hz=100")  # records are few, messages are not
     words = (
         "live",

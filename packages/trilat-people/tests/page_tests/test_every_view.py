@@ -6,7 +6,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from experiment_tests.experiments import APART, REACH, write_protocol
 from playwright.sync_api import Browser, Page
 from trilat_people.experiment.experiment_run import Experiment, begin_experiment
 from trilat_people.experiment.trial_run import ExperimentTrial, SyntheticTrial
@@ -15,6 +14,7 @@ from trilat_people.live_page.page_server import PageServer
 
 from tests.analysis.logs import BUSY, FOUR
 from tests.chains import six_joints
+from tests.experiments import APART, REACH, write_protocol
 from tests.live.browsers import needs_browser, shows
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork

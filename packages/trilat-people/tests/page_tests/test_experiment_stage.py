@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from experiment_tests.experiments import APART, REACH, write_protocol
 from trilat_people.experiment.experiment_analysis import analyse_experiment
 from trilat_people.experiment.experiment_run import (
     Experiment,
@@ -23,6 +22,7 @@ from trilat_people.live_page.experiment_stage import (
 from trilat_people.live_page.page_orders import AbortTrial, DoStep
 from trilat_people.live_page.page_server import PageServer
 
+from tests.experiments import APART, REACH, write_protocol
 from tests.live.page_client import page_client, with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
@@ -93,7 +93,7 @@ def assert_whole(experiment: Experiment) -> None:
     ]
 
 
-def test_people_are_asked_in_the_order_of_the_plan(experiment: Experiment) -> None:
+def test_people_are_asked_in_plan_order(experiment: Experiment) -> None:
     people = People(experiment)
     assert people.run()
     asked = list(dict.fromkeys(key for _, key in people.steps))
@@ -128,7 +128,7 @@ def killed_in(when: str, number: int) -> Any:
 
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize("when", ["the session", "its start"])
-def test_killed_program_goes_on_at_the_trial(
+def test_a_killed_program_resumes_at_the_trial(
     when: str, number: int, experiment: Experiment
 ) -> None:
     with pytest.raises(Killed):
@@ -143,7 +143,7 @@ def test_killed_program_goes_on_at_the_trial(
     assert aborted == (["the program was ended"] if when == "the session" else [])
 
 
-def test_trial_whose_log_was_in_place_counts_after_a_kill(
+def test_trials_with_finished_logs_survive_a_kill(
     experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def killed(*_: object) -> None:
@@ -163,7 +163,7 @@ def test_trial_whose_log_was_in_place_counts_after_a_kill(
     assert_whole(experiment)
 
 
-def test_full_disk_is_said_and_loses_nothing(experiment: Experiment) -> None:
+def test_a_full_disk_is_reported_and_loses_nothing(experiment: Experiment) -> None:
     def full(watch: TrialWatch, folder: Path) -> SessionResult | None:
         problems = ["recorder ended with code 5: No space left on device"]
         second = watch.trial.planned.number == 2
@@ -181,7 +181,7 @@ def test_full_disk_is_said_and_loses_nothing(experiment: Experiment) -> None:
 
 
 @pytest.mark.parametrize("step_ns", [-(10**13), 10**13])
-def test_wall_clock_that_steps_changes_only_times_of_notes(
+def test_stepping_wall_clocks_change_only_note_times(
     step_ns: int, experiment: Experiment
 ) -> None:
     people = People(experiment)
@@ -194,7 +194,7 @@ def test_wall_clock_that_steps_changes_only_times_of_notes(
     assert people.monotonic_ns() < 120 * NS_PER_S
 
 
-def test_aborted_trial_is_kept_aside_and_made_again(experiment: Experiment) -> None:
+def test_aborted_trials_are_kept_aside_and_repeated(experiment: Experiment) -> None:
     tries: list[str] = []
 
     def stops(watch: TrialWatch, folder: Path) -> SessionResult | None:
@@ -213,7 +213,7 @@ def test_aborted_trial_is_kept_aside_and_made_again(experiment: Experiment) -> N
     assert_whole(experiment)
 
 
-def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
+def test_logs_that_end_early_do_not_count(experiment: Experiment) -> None:
     trial = ExperimentTrial(
         experiment.plan.protocol,
         experiment.plan.scenarios["near"],
@@ -236,7 +236,7 @@ def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
     assert_whole(experiment)
 
 
-def test_people_and_models_of_them_share_no_folder(experiment: Experiment) -> None:
+def test_people_and_models_share_no_folder(experiment: Experiment) -> None:
     people = People(experiment)
     people.run(lambda watch, _: setattr(people, "ends", watch.trial.planned.number == 1))
     with pytest.raises(
@@ -310,9 +310,7 @@ def view_of(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> A
     return SimpleNamespace(running=True, sites={"s": site})
 
 
-def test_each_user_is_shown_its_own_target_and_the_corridor(
-    tmp_path: Path, clock: ManualClock
-) -> None:
+def test_users_see_own_target_and_corridor(tmp_path: Path, clock: ManualClock) -> None:
     def shown(task: str, site: str) -> Any:
         (folder := tmp_path / task[-3:] / (site or "-")).mkdir(parents=True)
         plan = begin_experiment(
@@ -346,14 +344,14 @@ def test_watch_judges_as_the_log_does(watched: Any, clock: ManualClock) -> None:
     assert watch.over
 
 
-def test_arm_that_is_stopped_ends_the_trial(watched: Any, clock: ManualClock) -> None:
+def test_a_stopped_arm_ends_the_trial(watched: Any, clock: ManualClock) -> None:
     trial, _, log = watched
     watch = TrialWatch(trial, clock)
     assert watch.poll(view_of(trial, log, 5, "stopped"), ()) == ["trial 1 aborted: s stopped"]
     assert watch.over
 
 
-def test_page_that_stays_away_ends_the_trial(
+def test_an_absent_page_ends_the_trial(
     experiment: Experiment, stage: Stage, watched: Any
 ) -> None:
     trial, _, log = watched

@@ -43,7 +43,7 @@ def raise_alarm(site: str, **changed: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("screen", SCREENS)
-def test_axe_finds_nothing_serious_in_what_is_raised(
+def test_axe_finds_nothing_serious_in_alarms(
     session: RecordedSession, address: str, browser: Browser, screen: str
 ) -> None:
     """Alarms, what a page is asked, and the report at the end."""
@@ -110,7 +110,7 @@ SMALL = """[...document.querySelectorAll("button, select, input, a")]
 .map(([one, box]) => `${one.outerHTML.slice(0, 60)} ${box.width.toFixed(0)}x${box.height.toFixed(0)}`)"""
 
 
-def test_a_phone_shows_arms_first_and_targets_of_44_px(
+def test_phones_show_arms_first_with_large_targets(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
     for role in ROLES:
@@ -126,7 +126,7 @@ def test_a_phone_shows_arms_first_and_targets_of_44_px(
 HELD = "trilat.parts.arms.cards.filter((card) => card.hold).map((card) => card.name)"
 
 
-def test_keys_lead_an_arm_wherever_one_has_clicked(
+def test_keys_lead_an_arm_anywhere(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
     with session.shown(browser, address, "experimenter", "desktop", "light") as page:
@@ -145,7 +145,7 @@ def test_keys_lead_an_arm_wherever_one_has_clicked(
         assert page.evaluate(HELD) == []
 
 
-def test_a_page_that_is_cut_off_says_so(
+def test_cut_off_pages_are_marked(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
     """It calls no arm silent for its own lag, and its buttons are off."""
@@ -163,7 +163,7 @@ def test_a_page_that_is_cut_off_says_so(
         assert page.is_disabled("#part")
 
 
-def test_a_pointer_means_the_nearest_arm_of_one_scene(
+def test_pointers_select_the_nearest_arm_in_scene(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
     with session.shown(browser, address, "experimenter", "desktop", "light") as page:

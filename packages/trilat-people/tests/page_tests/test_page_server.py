@@ -79,7 +79,7 @@ def flood(client: ClientConnection, count: int) -> None:
         client.send('{"do":"seen","n":0}')
 
 
-def test_it_serves_its_own_files_and_no_others(server: PageServer) -> None:
+def test_only_own_files_are_served(server: PageServer) -> None:
     status, policy, page = get(server, "/")
     assert status == 200
     assert b'src="main.js"' in page
@@ -114,13 +114,13 @@ def test_a_page_of_another_site_gets_no_socket(server: PageServer) -> None:
         assert "hello" in hears(own)
 
 
-def test_a_name_of_somebody_elses_that_leads_here_is_refused(server: PageServer) -> None:
+def test_foreign_names_for_this_address_are_refused(server: PageServer) -> None:
     """Against pages that resolve their own name to loopback."""
     assert get(server, "/", Host="evil.example")[0] == 403
     assert server.refused["foreign host"] == 1
 
 
-def test_port_in_use_is_found_before_folder_is_made(tmp_path: Path) -> None:
+def test_ports_in_use_are_found_before_folders(tmp_path: Path) -> None:
     with create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         done = trilat("live", "two_sites", "--port", str(port), "--no-browser", cwd=tmp_path)
@@ -158,9 +158,7 @@ def test_every_socket_needs_the_token_of_its_link(host: str, network: LocalNetwo
         assert get(server, "/")[0] == 200  # what everybody may read; a fragment is not sent
 
 
-def test_page_by_keys_is_encrypted_and_its_links_say_so(
-    network: LocalNetwork, tmp_path: Path
-) -> None:
+def test_pages_with_keys_are_encrypted_and_named(network: LocalNetwork, tmp_path: Path) -> None:
     """Page and socket, by the certificate of a member; beyond loopback nobody need say insecure."""
     (keys,) = create_keys(tmp_path / "keys", ["operator"])
     options = PageOptions(host="0.0.0.0", tls=keys)
@@ -186,7 +184,7 @@ def test_page_by_keys_is_encrypted_and_its_links_say_so(
             get(server, "/")  # without encryption
 
 
-def test_keys_that_cannot_be_used_are_found_before_anything_begins(tmp_path: Path) -> None:
+def test_unusable_keys_are_found_before_anything_begins(tmp_path: Path) -> None:
     create_keys(tmp_path / "keys", ["operator"])
     with pytest.raises(UsageError, match="name the folder of one member"):
         PageOptions(tls=tmp_path / "keys").check()
@@ -221,7 +219,7 @@ def test_nonsense_is_counted_and_dropped(server: PageServer, text: str, reason: 
 
 
 @pytest.mark.long
-def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(
+def test_megabytes_and_floods_end_the_connection(
     server: PageServer,
 ) -> None:
     with socket(server) as page:
@@ -238,7 +236,7 @@ def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(
         assert "hello" in hears(page)
 
 
-def test_only_a_participating_page_gives_orders_a_second_asks_first(
+def test_only_participating_pages_give_orders(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
@@ -264,7 +262,7 @@ def test_only_a_participating_page_gives_orders_a_second_asks_first(
     assert server.refused["does not take part"] == 1
 
 
-def test_what_page_wants_of_hand_is_in_range_or_refused(server: PageServer) -> None:
+def test_hand_requests_are_in_range_or_refused(server: PageServer) -> None:
     """An arm that is not there, or that nobody can hold, is refused; so is what is no number."""
     with socket(server) as page:
         page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
@@ -275,7 +273,7 @@ def test_what_page_wants_of_hand_is_in_range_or_refused(server: PageServer) -> N
         assert "hello" in hears(page)
 
 
-def test_a_pages_hands_are_its_own_and_end_with_it(network: LocalNetwork) -> None:
+def test_pages_hands_end_with_their_page(network: LocalNetwork) -> None:
     site = network.join()
     messages = site.inbox("trilat/s1/m1/hand")
     hands = [PageHands(network.join(), SystemClock(), "s1", f"page {n}") for n in (1, 2)]
@@ -309,7 +307,7 @@ def test_a_pages_hands_are_its_own_and_end_with_it(network: LocalNetwork) -> Non
         b"GET / HT",
     ],
 )
-def test_what_is_no_request_gets_400_and_is_counted(
+def test_invalid_requests_get_400_and_are_counted(
     server: PageServer, request_: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert raw(server, request_).startswith(b"HTTP/1.1 400 ")
@@ -331,7 +329,7 @@ def test_a_socket_that_breaks_the_protocol_is_counted(server: PageServer) -> Non
     assert server.refused["malformed request"] == 1
 
 
-def test_marks_hands_and_control_have_rates_letting_go_has_none(server: PageServer) -> None:
+def test_marks_hands_and_control_have_rate_limits(server: PageServer) -> None:
     with socket(server) as page:
         for _ in range(50):
             page.send('{"do":"mark","text":"a"}')
@@ -352,9 +350,7 @@ def test_marks_hands_and_control_have_rates_letting_go_has_none(server: PageServ
         until(lambda: server.refused["nobody can hold it"] == refused + 1)
 
 
-def test_any_page_stops_every_arm_past_what_waits_for_answer(
-    network: LocalNetwork, server: PageServer
-) -> None:
+def test_any_page_stops_every_arm_at_once(network: LocalNetwork, server: PageServer) -> None:
     site: LocalBus = network.join()
     changes, stops = site.query_inbox("trilat/s1/s/set"), site.query_inbox("trilat/s1/s/stop")
     server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
@@ -371,7 +367,7 @@ def test_any_page_stops_every_arm_past_what_waits_for_answer(
         until(lambda: server.refused["does not take part"] == 1)
 
 
-def test_an_experimenter_releases_arms_and_a_stop_takes_that_back(
+def test_experimenters_release_arms_until_a_stop(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
@@ -398,7 +394,7 @@ def test_an_experimenter_releases_arms_and_a_stop_takes_that_back(
         until(lambda: server.refused["malformed"] == 3)
 
 
-def test_a_stop_that_an_older_site_refuses_is_ordered_again(
+def test_stops_refused_by_older_sites_are_repeated(
     network: LocalNetwork, server: PageServer
 ) -> None:
     """It knows no source of an order, and refuses what names one."""
@@ -413,7 +409,7 @@ def test_a_stop_that_an_older_site_refuses_is_ordered_again(
         assert decode(again.payload, ChangeRequest) == ChangeRequest(order="stop")
 
 
-def test_what_fails_inside_is_counted_said_and_over(capfd: pytest.CaptureFixture[str]) -> None:
+def test_inner_failures_are_counted_and_reported(capfd: pytest.CaptureFixture[str]) -> None:
     """Names that Zenoh takes for expressions: no session has them, and the bus refuses them."""
     said: list[str] = []
     with (
@@ -437,7 +433,7 @@ def test_what_fails_inside_is_counted_said_and_over(capfd: pytest.CaptureFixture
     assert capfd.readouterr() == ("", "")
 
 
-def test_loop_that_ends_is_begun_again_at_same_address(network: LocalNetwork) -> None:
+def test_ended_loops_restart_at_the_same_address(network: LocalNetwork) -> None:
     said: list[str] = []
     with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server:
         address, loop = server.address, server._loop
@@ -495,7 +491,7 @@ def roles(
         yield made, told_links(made, said)
 
 
-def test_each_role_has_a_link_that_says_who_it_is(
+def test_each_role_has_a_link_naming_it(
     roles: tuple[PageServer, dict[str, str]],
 ) -> None:
     server, links = roles
@@ -542,7 +538,7 @@ def test_users_and_watchers_give_no_orders_but_stop(
     assert not server.end_requested.is_set()
 
 
-def test_a_users_token_opens_no_other_view() -> None:
+def test_a_users_token_opens_only_its_view() -> None:
     said: list[str] = []
     guarded = PageOptions(host="0.0.0.0", insecure=True)
     with PageServer(
@@ -572,7 +568,7 @@ def test_users_take_part_beside_experimenters(network: LocalNetwork) -> None:
         assert taking == {"user": True, "experimenter": True}
 
 
-def test_a_page_as_no_site_of_the_session_is_closed(server: PageServer) -> None:
+def test_pages_of_unknown_sites_are_closed(server: PageServer) -> None:
     server.view.scenario = load_scenario("paper")
     with (
         socket(server, link=with_query(server.address, "as=m9")) as page,
@@ -583,7 +579,7 @@ def test_a_page_as_no_site_of_the_session_is_closed(server: PageServer) -> None:
     assert closed.value.rcvd.reason == "the session has no such site"
 
 
-def test_report_and_log_are_the_experimenters_alone(
+def test_report_and_log_are_the_experimenters_only(
     server: PageServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At an address that no other page is told and nobody guesses; the report's scripts reach nothing."""
@@ -606,7 +602,7 @@ def test_report_and_log_are_the_experimenters_alone(
     assert get(server, "/report.html")[0] == get(server, "/secret/")[0] == 404
 
 
-def test_watchers_take_no_places_of_others(network: LocalNetwork) -> None:
+def test_watchers_take_no_other_places(network: LocalNetwork) -> None:
     """Whoever has the watchers' link takes all places of watchers, and locks nobody else out."""
     said: list[str] = []
     with (
@@ -653,7 +649,7 @@ def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNet
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HT", b"GET /three.module.min.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"]
 )
-def test_silent_and_slow_connections_keep_nobody_out(sent: bytes, server: PageServer) -> None:
+def test_silent_and_slow_connections_exclude_nobody(sent: bytes, server: PageServer) -> None:
     """Connections that say nothing, half of a request, or never read their answer."""
     at = urlsplit(server.address)
     with ExitStack() as stack:
@@ -684,7 +680,7 @@ def test_silent_connections_to_encrypted_page_are_closed(
             assert silent.recv(100) == b""
 
 
-def test_browser_is_opened_by_a_file_of_the_user(
+def test_browsers_are_opened_by_the_users_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The token stands in no command line, which every user of the machine can list."""

@@ -77,7 +77,7 @@ def test_experimenter_who_watches_takes_part_first(
 @pytest.mark.parametrize("role", ["user", "watcher"])
 @pytest.mark.parametrize("screen", SCREENS)
 @pytest.mark.parametrize("mode", ALARMS)
-def test_users_and_watchers_get_neither_button_nor_command(
+def test_users_and_watchers_cannot_release(
     session: RecordedSession, address: str, browser: Browser, mode: str, screen: str, role: str
 ) -> None:
     sites = alarmed(session, role, mode)
@@ -88,7 +88,7 @@ def test_users_and_watchers_get_neither_button_nor_command(
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_only_experimenters_who_are_cut_off_read_a_command(browser: Browser, role: str) -> None:
+def test_only_cut_off_experimenters_read_a_command(browser: Browser, role: str) -> None:
     """Their page can stop no arm any more; others tell the experimenter."""
     context = browser.new_context()
     try:
@@ -108,7 +108,7 @@ def test_only_experimenters_who_are_cut_off_read_a_command(browser: Browser, rol
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("screen", SCREENS)
-def test_silence_is_waited_for_and_is_no_end(
+def test_silence_is_waited_for(
     session: RecordedSession, address: str, browser: Browser, screen: str, role: str
 ) -> None:
     with session.shown(browser, address, role, screen, "light", silent_s=17.4) as page:
@@ -123,7 +123,7 @@ def test_silence_is_waited_for_and_is_no_end(
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("screen", SCREENS)
-def test_after_the_end_nothing_is_red_and_nothing_stops(
+def test_after_the_end_nothing_is_red(
     session: RecordedSession, address: str, browser: Browser, screen: str, role: str
 ) -> None:
     """Whatever the last records say: sites hold for their peers, which ended a moment before them."""
@@ -148,7 +148,7 @@ def test_after_the_end_nothing_is_red_and_nothing_stops(
         assert session.sent == []
 
 
-def test_a_site_that_is_silent_alone_says_for_how_long(
+def test_silent_sites_show_their_silences_length(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
     newest = session.frames["experimenter"][-1]["sites"]

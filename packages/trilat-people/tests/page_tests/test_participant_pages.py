@@ -6,11 +6,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from experiment_tests.experiments import write_protocol
 from playwright.sync_api import Browser, Page, WebSocketRoute
 from trilat_people.experiment.experiment_run import begin_experiment
 from trilat_people.live_page.experiment_stage import Stage
 
+from tests.experiments import write_protocol
 from tests.live.browsers import needs_browser
 from tests.live.page_client import with_query
 from tests.net.manual_clock import ManualClock
@@ -106,7 +106,7 @@ def test_untouched_sliders_are_empty_and_sent_as_missing(
 
 
 @pytest.mark.parametrize("screen", SCREENS)
-def test_a_touched_slider_is_placed_where_it_is_pressed(
+def test_touched_sliders_are_placed_where_pressed(
     address: str, browser: Browser, asked: dict[str, Json], screen: str
 ) -> None:
     with form_page(browser, address, asked["tlx"], screen) as (page, _):
@@ -119,7 +119,7 @@ def test_a_touched_slider_is_placed_where_it_is_pressed(
 
 
 @pytest.mark.parametrize("screen", SCREENS)
-def test_choices_that_nobody_makes_are_missing(
+def test_unmade_choices_are_missing(
     address: str, browser: Browser, asked: dict[str, Json], screen: str
 ) -> None:
     with form_page(browser, address, asked["trust"], screen) as (page, sent):

@@ -71,7 +71,7 @@ def drawn(log: Log, site: str, tick: int) -> list[Any]:
         ("two_sites", "m", ("s",), {"sites.m.view": JITTER, "sites.s.rate_hz": 400}),
     ],
 )
-def test_peers_are_drawn_as_the_log_says(
+def test_peers_are_drawn_as_logged(
     tmp_path: Path, scenario: str, site: str, peers: tuple[str, ...], links: dict[str, Any]
 ) -> None:
     keys = {"duration_s": 2.5, "link.delay_ms": 300, **links}
@@ -115,7 +115,7 @@ def test_a_user_is_shown_how_its_law_pulls(tmp_path: Path) -> None:
     assert largest > 1.0
 
 
-def test_a_peer_stays_until_its_missing_record_has_come(tmp_path: Path) -> None:
+def test_peers_stay_until_their_record_has_come(tmp_path: Path) -> None:
     """Never a newer one, and the one in use again once it can be had."""
     session = Session.whole(
         load_scenario("two_sites", {"duration_s": 3.0, "link.delay_ms": 20}), tmp_path
@@ -136,7 +136,7 @@ def test_a_peer_stays_until_its_missing_record_has_come(tmp_path: Path) -> None:
     assert behind[-1] == 0
 
 
-def test_a_user_is_told_nothing_that_it_cannot_know(tmp_path: Path) -> None:
+def test_users_are_told_only_what_they_know(tmp_path: Path) -> None:
     keys = {"duration_s": 1.5, "rate_hz": 200, "link.delay_ms": 100}
     session = Session.whole(load_scenario("paper", keys), tmp_path)
     frames: Frames = []
@@ -149,7 +149,7 @@ def test_a_user_is_told_nothing_that_it_cannot_know(tmp_path: Path) -> None:
     assert frames
 
 
-def test_bodies_of_a_peer_are_as_old_as_its_arm(tmp_path: Path) -> None:
+def test_bodies_are_as_old_as_their_arm(tmp_path: Path) -> None:
     plant = {"class": "tests.own_code:Carousel", "bodies": {"box": [0.2, 0.2, 0.1]}}
     keys = {"sites.s.plant": plant, "duration_s": 1.5, "link.delay_ms": 300}
     session = Session.whole(load_scenario("paper", keys), tmp_path)

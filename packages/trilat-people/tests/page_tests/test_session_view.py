@@ -45,7 +45,7 @@ class WatchedSession:
         self.clock.sleep_until(self.clock.monotonic_ns() + int(seconds * NS_PER_S))
 
 
-def test_silence_however_long_is_no_end() -> None:
+def test_silence_is_no_end() -> None:
     session = WatchedSession()
     session.wait(600.0)
     assert not session.view.ended
@@ -66,7 +66,7 @@ def test_the_last_end_message_ends_a_session() -> None:
     assert [session.view.silence_s(site) for site in session.view.sites.values()] == [0.0, 0.0]
 
 
-def test_whoever_ran_the_sites_may_say_the_end() -> None:
+def test_members_running_sites_may_report_the_end() -> None:
     """Sites that were killed send no end message."""
     session = WatchedSession()
     session.wait(60.0)
@@ -75,7 +75,7 @@ def test_whoever_ran_the_sites_may_say_the_end() -> None:
     assert session.view.session_silence_s == 60.0
 
 
-def test_a_session_whose_sites_have_all_left_has_ended() -> None:
+def test_sessions_end_when_all_sites_have_left() -> None:
     """The network reports that they are gone, as after a kill; a token of a recorder is no site."""
     session = WatchedSession()
     site, recorder = session.join(), session.join()

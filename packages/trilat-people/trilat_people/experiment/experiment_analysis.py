@@ -80,7 +80,7 @@ NOT_REACHED = "not reached"
 """Text of a median if half of the trials or more were not completed."""
 
 
-class MissingAnswers(NamedTuple):
+class _MissingAnswers(NamedTuple):
     """How many answers are missing in the questionnaires under one condition.
 
     Attributes:
@@ -252,7 +252,7 @@ class ExperimentAnalysis(Result):
             )
         return absent
 
-    def _count_missing_answers(self) -> Iterator[MissingAnswers]:
+    def _count_missing_answers(self) -> Iterator[_MissingAnswers]:
         """Counts the missing answers of each questionnaire, separately for each condition.
 
         A questionnaire has several items. A completed questionnaire, called form, belongs to
@@ -281,7 +281,7 @@ class ExperimentAnalysis(Result):
                 form_key = (row["participant"], row["block"])
                 answers_of_form.setdefault(form_key, []).append(row["value"])
             incomplete_forms = sum(None in answers for answers in answers_of_form.values())
-            yield MissingAnswers(
+            yield _MissingAnswers(
                 questionnaire=name,
                 condition=condition,
                 asked=len(rows),

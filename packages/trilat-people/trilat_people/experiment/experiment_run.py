@@ -73,7 +73,7 @@ class Note(msgspec.Struct, frozen=True):
     seed: int = 0
 
 
-class ExperimentStatus(NamedTuple):
+class _ExperimentStatus(NamedTuple):
     """How many trials of an experiment are done, and which one is next.
 
     Attributes:
@@ -216,12 +216,12 @@ class Experiment(Result):
                 )
                 notes.add(note)
 
-    def status(self) -> ExperimentStatus:
+    def status(self) -> _ExperimentStatus:
         """Returns how many trials are done, and which trial is next."""
         done = self.read_entries()
         remaining = [trial for trial in self.plan.trials if trial.number not in done]
         next_trial = remaining[0] if remaining else None
-        return ExperimentStatus(len(done), len(self.plan.trials), next_trial)
+        return _ExperimentStatus(len(done), len(self.plan.trials), next_trial)
 
     def run(
         self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None

@@ -54,7 +54,7 @@ Feedback = Literal[
 ]
 
 
-class CatchTrials(Frozen, frozen=True):
+class _CatchTrials(Frozen, frozen=True):
     """Trials of an unexpected condition that are mixed into a block of another condition.
 
     They keep participants from anticipating what the next trial is like. They do not count in
@@ -70,7 +70,7 @@ class CatchTrials(Frozen, frozen=True):
     share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.1
 
 
-class Training(Frozen, frozen=True):
+class _Training(Frozen, frozen=True):
     """Training in which the authority over the slave arm moves from an expert to a learner.
 
     The first user is the expert, the second user the learner.
@@ -160,8 +160,8 @@ class Protocol(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=3600.0)] = 0.0
     feedback: tuple[Feedback, ...] = ()
     force_limit_n: dict[Pseudonym, Positive] = field(default_factory=dict)
-    catch: CatchTrials | None = None
-    training: Training | None = None
+    catch: _CatchTrials | None = None
+    training: _Training | None = None
     staircase: Staircase | None = None
 
     def list_phases(

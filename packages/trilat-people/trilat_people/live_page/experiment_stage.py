@@ -174,7 +174,7 @@ class TrialWatch:
 
 
 @dataclass
-class StepRequest:
+class _StepRequest:
     """A step that the users are asked to complete now, such as a questionnaire.
 
     Attributes:
@@ -215,7 +215,7 @@ class Stage:
         self._plan = plan
         self._clock = clock
         self.shows_ages = plan.protocol.staircase is None
-        self._request: StepRequest | None = None
+        self._request: _StepRequest | None = None
         self._watch: TrialWatch | None = None
         self._step: Step | None = None
         self._phase = "checking"
@@ -225,7 +225,7 @@ class Stage:
 
     def request_step(
         self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()
-    ) -> StepRequest:
+    ) -> _StepRequest:
         """Asks the users on their pages to complete a step, such as a questionnaire.
 
         Args:
@@ -237,7 +237,7 @@ class Stage:
             The request, in which the replies of the users are collected.
         """
         rest_end_ns = self._clock.monotonic_ns() + int(rest_s * NS_PER_S)
-        request = StepRequest(step, rest_end_ns)
+        request = _StepRequest(step, rest_end_ns)
         request.replies |= {site: ({}, 0) for site in done}
         self._step = step
         self._watch = None

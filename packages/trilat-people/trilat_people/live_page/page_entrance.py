@@ -58,7 +58,7 @@ class Strangers:
         self._connections.pop(connection, None)
 
 
-class SeatedPage(Protocol):
+class _SeatedPage(Protocol):
     """Describes the fields of an open web page by which the server limits the number of pages.
 
     The class `page_server.Page` has these fields.
@@ -74,10 +74,10 @@ class SeatedPage(Protocol):
     takes_part: bool
 
 
-Page = TypeVar("Page", bound=SeatedPage)
+Page = TypeVar("Page", bound=_SeatedPage)
 
 
-def is_full(pages: Iterable[SeatedPage], role: Role) -> bool:
+def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
     """Finds out whether there are as many open pages of a role as allowed.
 
     Args:

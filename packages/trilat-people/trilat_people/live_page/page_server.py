@@ -122,7 +122,7 @@ MAX_DURATION_S = 3600.0
 _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
-class Visitor(ServerConnection):
+class _Visitor(ServerConnection):
     """Connection of a browser to the server, from its beginning until it is closed.
 
     Any program can connect. Data that are not a valid request of a browser are counted, and
@@ -502,7 +502,7 @@ class PageServer:
             self._port,
             ssl=self._tls,
             process_request=self._answer_http,
-            create_connection=type("Counted", (Visitor,), members),
+            create_connection=type("Counted", (_Visitor,), members),
             max_size=MAX_MESSAGE_BYTES,
             max_queue=32,
             compression=None,
@@ -663,7 +663,7 @@ class PageServer:
 
         self._close_page_for(role)
         self._pages.add(page)
-        if isinstance(connection, Visitor):
+        if isinstance(connection, _Visitor):
             connection.strangers.remove(connection)
         if role.kind == "experimenter":
             self._opening.remove_file()

@@ -68,7 +68,7 @@ def _round(values: Array, digits: int = 5) -> list[Any]:
     return rounded
 
 
-class ArmFrames:
+class _ArmFrames:
     """Composes the parts of a page's messages that describe one arm: shape, pose and forces.
 
     Args:
@@ -351,7 +351,7 @@ class SessionFrames:
 
     def __init__(self, view: SessionView) -> None:
         self._view = view
-        self._arms: dict[str, ArmFrames] = {}
+        self._arms: dict[str, _ArmFrames] = {}
         self._arm_constants: Json = {}
         # The newest tick of each site in the previous frame.
         self._last_ticks: dict[str, int] = {}
@@ -373,9 +373,9 @@ class SessionFrames:
         scenario = view.scenario
         # Prepared before the session runs, because loading the compiled arms takes seconds.
         if scenario is not None and not self._arms:
-            arms: dict[str, ArmFrames] = {}
+            arms: dict[str, _ArmFrames] = {}
             for site in scenario.names:
-                arms[site] = ArmFrames(scenario, site)
+                arms[site] = _ArmFrames(scenario, site)
             self._arms = arms
             for site, arm in self._arms.items():
                 self._arm_constants[site] = arm.describe()
@@ -570,7 +570,7 @@ class SessionFrames:
             tick: Tick of the peer (period of its control loop) that the user sees.
 
         Returns:
-            The pose as `ArmFrames.describe_pose` returns it, its tick, and the poses of the
+            The pose as `_ArmFrames.describe_pose` returns it, its tick, and the poses of the
             bodies that the arm can touch. Before the first record, the pose at the start.
         """
         arm = self._arms[peer]
@@ -598,9 +598,9 @@ class SessionFrames:
             site: What is known about the site. It must have published a record.
 
         Returns:
-            The state as plain values for JSON: that of `ArmFrames.describe_now`, and the fields
-            that are explained below. In addition, the four largest values since the previous
-            frame, as `ArmFrames.describe_now` returns them.
+            The state as plain values for JSON: that of `_ArmFrames.describe_now`, and the
+            fields that are explained below. In addition, the four largest values since the
+            previous frame, as `_ArmFrames.describe_now` returns them.
         """
         record = site.record
         stats = site.stats

@@ -1,4 +1,6 @@
-"""What comes from ROS 2: what moves an arm, what is refused and how it is said, and when an arm is let go."""
+"""The bridge from ROS 2: messages that move an arm, refusals and their reasons, and the release
+of an arm.
+"""
 
 import csv
 import json
@@ -71,14 +73,14 @@ NAMES = [("m1_q1", "q1"), ("m1_q2", "q2")]
 
 
 class HeldArm:
-    """A hand of which it is noted what is done with it."""
+    """A hand that notes every call."""
 
     def __init__(self) -> None:
         self.goals: list[tuple[float, ...]] = []
         self.holds = False
 
     def move(self, *goal: float) -> int:
-        if any(abs(one) > 1e6 for one in goal):
+        if any(abs(coordinate) > 1e6 for coordinate in goal):
             raise UsageError("is beyond the arm")
         self.goals.append(goal)
         self.holds = True
@@ -89,7 +91,7 @@ class HeldArm:
 
 
 class Desk:
-    """A topic `target_pose` of an arm in the plane, its clock, and what was said."""
+    """The topic `target_pose` of a planar arm, with a clock and the texts that were printed."""
 
     def __init__(self) -> None:
         self.arm, self.clock, self.said = HeldArm(), ManualClock(), list[str]()
@@ -114,7 +116,7 @@ def joints(names: Sequence[str], angles: Sequence[float]) -> bytes:
     return cdr.JointStatePacker(names, velocity=False, effort=False).pack(0, angles)
 
 
-def test_a_pose_moves_the_target_and_silence_lets_go() -> None:
+def test_a_pose_moves_the_target_until_silence() -> None:
     desk = Desk()
     desk.hears(0.1)
     desk.hears(0.2, after_ns=SILENCE_NS)
@@ -144,7 +146,7 @@ def test_two_publishers_move_nothing_until_one_is_gone() -> None:
 
 
 @given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
-def test_whatever_comes_is_taken_or_counted(data: bytes) -> None:
+def test_every_message_is_taken_or_counted(data: bytes) -> None:
     desk = Desk()
     desk.take(data, FIRST)
     assert len(desk.arm.goals) + desk.refusals.counts.total() == 1
@@ -152,7 +154,7 @@ def test_whatever_comes_is_taken_or_counted(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, 1e7])
-def test_an_impossible_target_is_refused_and_the_last_one_stays(x: float) -> None:
+def test_an_impossible_target_leaves_the_last_target(x: float) -> None:
     desk = Desk()
     desk.hears(0.1)
     desk.hears(x)
@@ -172,7 +174,7 @@ def test_a_pose_in_another_frame_moves_nothing() -> None:
     ]
 
 
-def test_joints_are_found_by_their_names_in_any_order() -> None:
+def test_joints_are_found_by_name_in_any_order() -> None:
     assert read_joint_target(NAMES, joints(["m1_q2", "m1_q1"], [2.0, 1.0])) == [1.0, 2.0]
     assert read_joint_target(NAMES, joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])) == [
         1.0,
@@ -189,7 +191,7 @@ def test_joints_are_found_by_their_names_in_any_order() -> None:
         (["q1", "q2", "q1"], [1.0, 2.0, 3.0], "has q1 twice"),
     ],
 )
-def test_joints_that_are_missing_or_not_finite_are_named(
+def test_missing_and_non_finite_joints_are_named(
     names: list[str], angles: list[float], said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
@@ -203,7 +205,7 @@ FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGE
 """The examples of the pages."""
 
 
-def test_the_table_of_topics_has_every_topic() -> None:
+def test_the_table_of_topics_is_complete() -> None:
     table = Path(__file__).parents[4] / "docs" / "data" / "ros2-topics.csv"
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -213,7 +215,7 @@ def test_the_table_of_topics_has_every_topic() -> None:
     assert listed == published | {"events", "log", "sent_..."}
 
 
-def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
+def test_topics_have_the_names_in_a_file(tmp_path: Path) -> None:
     (tmp_path / "names.toml").write_text(FILE)
     table = read_topic_table(str(tmp_path / "names.toml"))
     assert table.find("play", "m1", "joint_states") == "play/m1/arm/joint_states"
@@ -253,9 +255,7 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_names_that_cannot_be_right_are_refused(
-    tmp_path: Path, text: str | None, said: str
-) -> None:
+def test_invalid_names_are_refused(tmp_path: Path, text: str | None, said: str) -> None:
     file = tmp_path / "names.toml"
     if text is not None:
         file.write_text(text)
@@ -264,7 +264,7 @@ def test_names_that_cannot_be_right_are_refused(
 
 
 @pytest.mark.parametrize("site", ["m", "nobody"])
-def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site: str) -> None:
+def test_a_site_without_external_arm_takes_no_robot(tmp_path: Path, site: str) -> None:
     (tmp_path / "names.toml").write_text(
         FILE.replace("sites.s", f"sites.{site}").replace("sites.m1", "sites.s")
     )
@@ -276,7 +276,7 @@ def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site:
         refuse_other_robots(read_topic_table(str(tmp_path / "names.toml")), scenario)
 
 
-def test_reasons_that_strangers_invent_are_counted_and_not_kept() -> None:
+def test_reasons_of_strangers_are_counted_but_not_kept() -> None:
     said: list[str] = []
     refusals = Refusals(said.append)
     for n in range(1000):
@@ -286,14 +286,14 @@ def test_reasons_that_strangers_invent_are_counted_and_not_kept() -> None:
 
 
 class Topic(list[bytes]):
-    """A topic to which somebody listens, and what came on it."""
+    """A topic with a subscriber, and the messages published on it."""
 
     has_subscribers = True
     put = list.append
 
 
 class Listener:
-    """A graph in which every topic is heard, and nobody says anything."""
+    """A graph in which every topic has a subscriber and nobody publishes."""
 
     connected = True
 
@@ -314,20 +314,20 @@ class Listener:
 
 
 def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
-    found = {"world": (np.zeros(3), Rotation.identity())}
-    for one in frames:
+    frames_by_name = {"world": (np.zeros(3), Rotation.identity())}
+    for frame in frames:
         (at, turned), move, turn = (
-            found[one.header.frame_id],
-            one.transform.translation,
-            one.transform.rotation,
+            frames_by_name[frame.header.frame_id],
+            frame.transform.translation,
+            frame.transform.rotation,
         )
-        place = at + turned.apply([move.x, move.y, move.z])
-        found[one.child_frame_id] = (
-            place,
+        position = at + turned.apply([move.x, move.y, move.z])
+        frames_by_name[frame.child_frame_id] = (
+            position,
             turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]),
         )
-    return [where for name, where in found.items() if name.startswith(f"{site}/")] + [
-        found["world"]
+    return [where for name, where in frames_by_name.items() if name.startswith(f"{site}/")] + [
+        frames_by_name["world"]
     ]
 
 
@@ -341,13 +341,13 @@ def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
         pytest.param(posed_arms(), id="posed"),
     ],
 )
-def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
+def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
         ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
-        shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
-        shown.publish(log[site].states[-1], 1000.0)
+        site_topics = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+        site_topics.publish(log[site].states[-1], 1000.0)
         messages = [
             ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]
         ]
@@ -356,20 +356,25 @@ def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
             graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped"
         )
         where, turn = tip.pose.position, tip.pose.orientation
-        held = next(
-            one for one in frames if one.child_frame_id == tip.header.frame_id
+        transform = next(
+            frame for frame in frames if frame.child_frame_id == tip.header.frame_id
         ).transform
         base = Rotation.from_quat(
-            [held.rotation.x, held.rotation.y, held.rotation.z, held.rotation.w]
+            [
+                transform.rotation.x,
+                transform.rotation.y,
+                transform.rotation.z,
+                transform.rotation.w,
+            ]
         )
-        place = base.apply([where.x, where.y, where.z])
-        place += [held.translation.x, held.translation.y, held.translation.z]
+        position = base.apply([where.x, where.y, where.z])
+        position += [transform.translation.x, transform.translation.y, transform.translation.z]
         turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
-        apart = [
-            max(np.abs(at - place).max(), (way.inv() * turned).magnitude())
+        distances = [
+            max(np.abs(at - position).max(), (way.inv() * turned).magnitude())
             for at, way in compose(frames, site)
         ]
-        assert min(apart) < 1e-7
+        assert min(distances) < 1e-7
 
 
 def shares(*numbers: float) -> bytes:
@@ -382,12 +387,12 @@ def shares(*numbers: float) -> bytes:
     )
 
 
-def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
-    asked: list[dict[str, float]] = []
+def test_shares_are_requested_once_and_refusals_are_reported() -> None:
+    requests: list[dict[str, float]] = []
     said: list[str] = []
 
     def change(wanted: dict[str, float]) -> None:
-        asked.append(wanted)
+        requests.append(wanted)
         if sum(wanted.values()) != 1.0:
             raise RunFailed("must sum to 1")
 
@@ -407,7 +412,7 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
         take(data, FIRST)
         ask()
         ask()
-    assert asked == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
+    assert requests == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
     assert said == [
         "refused: t/s/set_dominance must sum to 1",
         "refused: t/s/set_dominance has 1 number, but needs one weight for each peer: m1, m2",
@@ -418,7 +423,7 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
     clock.sleep_until(2 * SENDER_TIMEOUT_NS)
     take(shares(0.5, 0.1), FIRST)
     ask()
-    assert asked[2:] == [{"m1": 0.5, "m2": 0.1}]
+    assert requests[2:] == [{"m1": 0.5, "m2": 0.1}]
 
 
 @given(
@@ -445,7 +450,7 @@ def test_shares_are_those_that_the_certificate_sees(
         )
 
 
-def test_shares_that_change_ten_times_a_second_are_shown() -> None:
+def test_shares_that_change_at_10_hz_are_shown() -> None:
     history = ShareHistory(load_scenario("paper"), "s")
     for n in range(3_600):
         to = {"m1": 0.25, "m2": 0.75} if n % 2 else {"m1": 0.75, "m2": 0.25}
@@ -457,7 +462,9 @@ def test_shares_that_change_ten_times_a_second_are_shown() -> None:
 
 
 class Robot:
-    """A robot whose controller has another order than the scenario, its site, and what lies between."""
+    """A robot whose controller orders joints otherwise than the scenario, its site, and the
+    bridge between them.
+    """
 
     def __init__(self, controller: Sequence[str] = ("elbow", "shoulder")) -> None:
         network, self.clock, self.said = LocalNetwork(), ManualClock(10**9), list[str]()
@@ -509,7 +516,7 @@ class Robot:
         return [message.data.tolist() for message in got]
 
 
-def test_joint_states_of_a_robot_are_its_sites_measurements() -> None:
+def test_joint_states_are_measurements_of_the_site() -> None:
     robot, of_another_clock = Robot(), 1_790_000_000 * 10**9
     robot.says(
         ["gripper", "elbow", "shoulder"],
@@ -560,7 +567,7 @@ def test_two_robots_on_one_topic_measure_nothing() -> None:
 
 
 @given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
-def test_whatever_asks_for_shares_or_angles_is_taken_or_counted(data: bytes) -> None:
+def test_any_request_for_shares_is_taken_or_counted(data: bytes) -> None:
     refusals, asked, turned = (
         Refusals(list[str]().append),
         list[dict[str, float]](),
@@ -580,13 +587,13 @@ def test_whatever_asks_for_shares_or_angles_is_taken_or_counted(data: bytes) -> 
 
 
 @given(st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
-def test_whatever_a_robot_says_is_taken_passed_over_or_counted(data: bytes) -> None:
+def test_any_message_of_a_robot_is_counted_somewhere(data: bytes) -> None:
     robot = Robot()
     robot.take(data, FIRST)
     assert len(robot.measured()) + robot.refusals.counts.total() <= 1
 
 
-def test_a_robot_gets_each_torque_once_in_its_own_order() -> None:
+def test_a_robot_gets_each_torque_once_in_order() -> None:
     robot = Robot()
     robot.ticks(0, 3.0, 4.0)
     assert robot.driven() == [[4.0, 3.0]]
@@ -596,7 +603,7 @@ def test_a_robot_gets_each_torque_once_in_its_own_order() -> None:
     assert robot.driven(2_000_000) == [[8.0, 7.0]]
 
 
-def test_a_robot_without_a_torque_gets_the_safe_command() -> None:
+def test_a_robot_without_torque_gets_the_safe_command() -> None:
     robot, safe = Robot(), [[0.5, -0.5]]
     assert robot.driven() == safe  # the site has made no tick
     assert robot.driven(SAFE_PERIOD_NS - 1) == []
@@ -619,7 +626,7 @@ def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
 
 
 class Sites:
-    """The sites of a session: who they are, what they have noted, and records; a bridge that shows them."""
+    """The sites of a session: their identities, notes and records, and a bridge that shows them."""
 
     def __init__(
         self, noted: Sequence[Event], scenario: str = "paper", session: str = "t"
@@ -678,7 +685,7 @@ class Sites:
         bridge.join()
 
     def seconds(self) -> set[int]:
-        """Of the stamps that were shown."""
+        """The stamps that were shown, in seconds."""
         states = [
             ROS.deserialize_cdr(data, "sensor_msgs/msg/JointState")
             for data in self.graph.came["t/s/joint_states"]
@@ -690,7 +697,7 @@ def event(kind: str, **fields: Any) -> Event:
     return Event(member="s", boot=1, kind=kind, text="", **fields)
 
 
-def test_a_session_begun_anew_is_shown_with_its_epoch() -> None:
+def test_a_new_session_is_shown_with_its_epoch() -> None:
     sites = Sites([])
     sites.begin(10**18)
     with sites.shown() as bridge:
@@ -702,19 +709,19 @@ def test_a_session_begun_anew_is_shown_with_its_epoch() -> None:
     with sites.shown():
         assert sites.seconds() == {2 * 10**9}
     assert sites.anew == [True, False]
-    told = ["waiting for session 't' to begin", "session t is in the graph of ROS 2: /t/..."]
-    assert sites.said == told * 2
+    texts = ["waiting for session 't' to begin", "session t is in the graph of ROS 2: /t/..."]
+    assert sites.said == texts * 2
 
 
-def test_shares_that_were_changed_before_are_shown() -> None:
+def test_earlier_changes_of_shares_are_shown() -> None:
     change = '{"at_s": 0.001, "dominance": "s", "to": {"m1": 0.75, "m2": 0.25}}'
     sites = Sites(
         [event("setup"), event("change", command="none"), event("change", command=change)]
     )
     sites.begin(10**18)
     with sites.shown():
-        (told,) = until(lambda: sites.graph.came["t/s/dominance"])
-        assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [
+        (ramp,) = until(lambda: sites.graph.came["t/s/dominance"])
+        assert ROS.deserialize_cdr(ramp, "std_msgs/msg/Float64MultiArray").data.tolist() == [
             0.75,
             0.25,
         ]
@@ -722,18 +729,18 @@ def test_shares_that_were_changed_before_are_shown() -> None:
 
 
 def list_bag(path: Path) -> dict[str, tuple[str, bool]]:
-    """Type of every topic of a bag, and whether it is latched, by rosbags."""
+    """Returns, for every topic of a bag as rosbags reads it, the type and whether the topic is latched."""
     with Reader(path) as bag:
         return {
-            one.topic.removeprefix("/"): (
-                one.msgtype,
-                one.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL",  # type: ignore[union-attr]
+            connection.topic.removeprefix("/"): (
+                connection.msgtype,
+                connection.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL",  # type: ignore[union-attr]
             )
-            for one in bag.connections
+            for connection in bag.connections
         }
 
 
-def test_a_bag_has_the_topics_of_the_live_bridge(tmp_path: Path) -> None:
+def test_bags_have_the_topics_of_live_bridges(tmp_path: Path) -> None:
     bag = list_bag(made(tmp_path)["bag"])
     sites = Sites([], "two_sites", "lab")
     sites.begin(10**18)
@@ -751,7 +758,7 @@ def test_a_bag_has_the_topics_of_the_live_bridge(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["six_joints", "wall_in_space", "box", "handover"])
 @pytest.mark.parametrize("naming", ["crisp", "crtk"])
-def test_bags_of_other_scenarios_have_no_topic_of_their_own(
+def test_bags_of_other_scenarios_share_no_topics(
     tmp_path: Path, name: str, naming: str
 ) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.02})
@@ -789,9 +796,9 @@ RVIZ_TYPES = {
 
 
 def list_rviz_topics(config: Path) -> dict[str, tuple[str, bool]]:
-    """Type of every topic of a configuration of RViz, and whether it must be latched."""
+    """Returns, for every topic of an RViz configuration, the type and whether the topic must be latched."""
     manager = YAML(typ="safe").load(config)["Visualization Manager"]
-    found = {}
+    types = {}
     for display in manager["Displays"]:
         topic = display.get("Topic") or display.get("Description Topic")
         if topic is None:
@@ -799,8 +806,8 @@ def list_rviz_topics(config: Path) -> dict[str, tuple[str, bool]]:
             continue
         latched = topic["Durability Policy"] == "Transient Local"
         assert topic["Value"].startswith("/")
-        found[topic["Value"][1:]] = RVIZ_TYPES[display["Class"]], latched
-    return found
+        types[topic["Value"][1:]] = RVIZ_TYPES[display["Class"]], latched
+    return types
 
 
 @pytest.mark.parametrize(
@@ -815,14 +822,14 @@ def test_rviz_has_the_topics_of_the_live_bridge(tmp_path: Path, name: str, namin
         SiteTopics(ends, scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
     config = tmp_path / "view.rviz"
     write_session_config(ends, scenario, config)
-    shown = list_rviz_topics(config)
-    assert shown.items() <= graph.offered.items()
+    types = list_rviz_topics(config)
+    assert types.items() <= graph.offered.items()
     poses = {topic for topic, (kind, _) in graph.offered.items() if kind == cdr.POSE}
     arms = {f"{name}/{site}/robot_description" for site in scenario.names}
-    assert shown.keys() == poses | arms
+    assert types.keys() == poses | arms
 
 
-def test_rviz_s_fixed_frame_is_above_all_frames(tmp_path: Path) -> None:
+def test_the_fixed_frame_of_rviz_is_the_root(tmp_path: Path) -> None:
     log = trilat_net.simulate("two_sites", {"duration_s": 0.02})
     trilat_net.view(log.save(tmp_path / "run.mcap"), rviz=True)
     config = YAML(typ="safe").load(tmp_path / "run.rviz")
@@ -831,20 +838,20 @@ def test_rviz_s_fixed_frame_is_above_all_frames(tmp_path: Path) -> None:
         assert RobotModel(log.scenario, site).frames[0][0] == fixed
 
 
-def test_a_bag_and_its_log_have_one_view_in_rviz(tmp_path: Path) -> None:
+def test_a_bag_and_a_log_share_one_view(tmp_path: Path) -> None:
     log = trilat_net.simulate("two_sites", {"duration_s": 0.02})
     file = log.save(tmp_path / "run.mcap")
     bag = trilat_net.export(log, "ros2", tmp_path / "bag.mcap")
     for path in (file, bag):
         trilat_net.view(path, rviz=True)
-    shown = list_rviz_topics(tmp_path / "run.rviz")
-    assert shown == list_rviz_topics(tmp_path / "bag.rviz")
-    assert shown.items() <= list_bag(bag).items()
+    types = list_rviz_topics(tmp_path / "run.rviz")
+    assert types == list_rviz_topics(tmp_path / "bag.rviz")
+    assert types.items() <= list_bag(bag).items()
     with pytest.raises(UsageError, match="already exists"):
         trilat_net.view(bag, rviz=True)
 
 
-def test_the_bridge_writes_what_rviz_shows(tmp_path: Path) -> None:
+def test_the_bridge_writes_the_frames_rviz_shows(tmp_path: Path) -> None:
     config = tmp_path / "view.rviz"
     sites = Sites([], "two_sites", "lab")
     sites.begin(10**18)

@@ -1,4 +1,6 @@
-"""The suite: its runs are the program's runs, interruptions leave no trace, and its intervals are SciPy's."""
+"""The suite: its runs are the program's runs, interruptions leave no trace, and its intervals
+equal SciPy's.
+"""
 
 import shlex
 from collections.abc import Iterator
@@ -78,8 +80,8 @@ from trilat_net.work.study_folder import encode_csv
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}
 
 
-def asked(**more: Any) -> BenchPlan:
-    """Two cells of two sites, one of them with two seeds."""
+def plan_small_suite(**more: Any) -> BenchPlan:
+    """Returns a request for two cells of two sites, one cell with two seeds."""
     return plan_bench(
         **{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more}
     )
@@ -95,36 +97,44 @@ def files(results: BenchResults) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
-    folder = prepare_bench_folder(asked(), tmp_path_factory.mktemp("suite") / "whole")
+    folder = prepare_bench_folder(
+        plan_small_suite(), tmp_path_factory.mktemp("suite") / "whole"
+    )
     return run_bench(folder, jobs=1)
 
 
-def test_an_interrupted_suite_goes_on_to_the_same_bytes(
+def test_an_interrupted_suite_resumes_to_the_same_bytes(
     whole: BenchResults, tmp_path: Path
 ) -> None:
-    folder, made = prepare_bench_folder(asked(), tmp_path / "parts"), []
+    folder, finished = prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), []
 
     def stop(done: int, _total: int) -> None:
-        made.append(done)
+        finished.append(done)
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run_bench(folder, jobs=1, progress=stop)
-    again = run_bench(prepare_bench_folder(asked(), tmp_path / "parts"), jobs=1, progress=stop)
-    assert made == [1, 2, 3]
+    again = run_bench(
+        prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), jobs=1, progress=stop
+    )
+    assert finished == [1, 2, 3]
     assert again.runs == whole.runs
     assert files(again) == files(whole)
 
 
 @pytest.mark.long
-def test_what_runs_the_cells_enters_no_result(whole: BenchResults, tmp_path: Path) -> None:
+def test_the_executor_of_the_cells_changes_no_result(
+    whole: BenchResults, tmp_path: Path
+) -> None:
     with ThreadPoolExecutor(1) as executor:
-        found = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
-    assert files(found) == files(whole)
+        bench = run_bench(
+            prepare_bench_folder(plan_small_suite(), tmp_path / "elsewhere"), on=executor
+        )
+    assert files(bench) == files(whole)
 
 
-def test_seeds_are_other_runs_where_anything_is_drawn(whole: BenchResults) -> None:
+def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
     still, first, second = whole.runs
     assert (still.random, first.random) == (False, True)
     assert first.error_rad != second.error_rad
@@ -132,11 +142,11 @@ def test_seeds_are_other_runs_where_anything_is_drawn(whole: BenchResults) -> No
     assert run_bench_task(BenchRunItem(lossy, 2)) == second
 
 
-def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
+def test_a_cell_equals_the_log_of_its_command(whole: BenchResults) -> None:
     cell = whole.plan.cells[1]
-    words = shlex.split(cell.build(1).command)
-    assert words[:3] == ["trilat", "sim", "_bench_two"]
-    log = trilat_net.simulate(load_scenario(words[2], words[4::2]))
+    arguments = shlex.split(cell.build(1).command)
+    assert arguments[:3] == ["trilat", "sim", "_bench_two"]
+    log = trilat_net.simulate(load_scenario(arguments[2], arguments[4::2]))
     run, user = whole.runs[1], log["m1"]
     assert log.scenario.sha256 == run.sha256
     off = log["s"].q - user.q
@@ -145,7 +155,7 @@ def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
     assert run.hand_nm == pytest.approx(np.sqrt(np.mean(hand**2)), rel=1e-12)
 
 
-def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
+def test_effort_equals_that_of_the_compiled_run(whole: BenchResults) -> None:
     scenario = whole.plan.cells[0].build(1).scenario
     run = FusedRun(scenario)
     run.advance_to(scenario.duration_s)
@@ -153,7 +163,7 @@ def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
 
 
 def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
-    """Pose of the user's arm at rest under P+d, and the torque of the hand on it."""
+    """Returns the pose of the user's arm at rest under P+d, and the torque of the hand on that arm."""
     target = np.array(settings["sites.m1.hands"][0]["to_rad"])
 
     def unbalanced(q: Array) -> Array:
@@ -166,9 +176,9 @@ def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
     return q, 50.0 * (target - q)
 
 
-def test_stiffness_at_the_hand_is_that_of_statics() -> None:
-    """Two springs and the wall of P+d, which is nearly at rest 2 s after contact."""
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+def test_stiffness_at_the_hand_is_static() -> None:
+    """Two springs and the wall under P+d, nearly at rest 2 s after contact."""
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
         q, torque = rest_in_contact(60.0, settings)
@@ -179,8 +189,8 @@ def test_stiffness_at_the_hand_is_that_of_statics() -> None:
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=5e-2)
 
 
-def test_stiffness_is_that_of_the_logs_two_seconds_after_contact() -> None:
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+def test_stiffness_is_measured_two_seconds_after_contact() -> None:
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     cell = with_gains(cell, K=60.0, d=6.0)
     built, ends = cell.build(1), []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
@@ -202,19 +212,19 @@ def test_stiffness_is_that_of_the_logs_two_seconds_after_contact() -> None:
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-6)
 
 
-def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
+def test_free_impedance_is_that_of_coupled_arms() -> None:
     """P+d over 4 ms: D = M s^2 + (d + 0.5) s + K - K e^-sT (M s^2 + d s + K)^-1 K e^-sT."""
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     K, d, s = 60.0, 12.0, 2j * np.pi
     q, _ = rest_in_contact(K, TASKS["contact"].settings)
     cosine = np.cos(q[1])
     M = np.array([[3.0 + 2.0 * cosine, 1.0 + cosine], [1.0 + cosine, 1.0]])
-    one = np.eye(2)
+    identity = np.eye(2)
     coupling = K * np.exp(-4e-3 * s)
-    slave = M * s**2 + (d * s + K) * one
-    user = M * s**2 + ((d + 0.5) * s + K) * one - coupling**2 * np.linalg.inv(slave)
+    slave = M * s**2 + (d * s + K) * identity
+    user = M * s**2 + ((d + 0.5) * s + K) * identity - coupling**2 * np.linalg.inv(slave)
     jacobian = reach(q)[1]
-    motion = np.linalg.solve(user + (5.0 * s + 50.0) * one, jacobian[0])
+    motion = np.linalg.solve(user + (5.0 * s + 50.0) * identity, jacobian[0])
     force = np.linalg.solve(jacobian.T, user @ motion)
     expected = abs(force[0] / (s * (jacobian @ motion)[0]))
     run = run_bench_task(BenchRunItem(with_gains(cell, K=K, d=d), 1))
@@ -223,7 +233,7 @@ def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
 
 
 def reach(q: Array) -> tuple[Array, Array]:
-    """The end effector of two links of 1 m, and its Jacobian."""
+    """Returns the end effector of two links of 1 m, and its Jacobian."""
     a, b = q[0], q[0] + q[1]
     tip = np.array([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)])
     return tip, np.array([[-tip[1], -np.sin(b)], [tip[0], np.cos(b)]])
@@ -233,8 +243,8 @@ def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
     return cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
 
 
-def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
-    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+def test_a_barely_touched_wall_masks_the_numbers() -> None:
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     run = run_bench_task(BenchRunItem(with_gains(cell, K=2.0, d=20.0), 1))
     assert run.wall_n is not None
     assert run.wall_n < LEAST_CONTACT_N
@@ -246,8 +256,8 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     assert "no contact" in build_bench_page(results, "trilat bench")
 
 
-def test_what_is_not_stable_stays_so_over_twice_the_length(tmp_path: Path) -> None:
-    (cell,) = asked(links=["rtt272"]).cells
+def test_a_longer_run_stays_unstable(tmp_path: Path) -> None:
+    (cell,) = plan_small_suite(links=["rtt272"]).cells
     plan = BenchPlan("round-trips", [with_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
     (run,) = run_bench(prepare_bench_folder(plan, tmp_path / "suite"), jobs=1).runs
     assert run.stability is Stability.NOT_STABLE
@@ -259,15 +269,15 @@ def test_what_is_not_stable_stays_so_over_twice_the_length(tmp_path: Path) -> No
 
 
 def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
-    """Records of one joint."""
+    """Returns records of one joint."""
     zero = np.zeros((len(t_ns), 1))
     return RecordBatch(
         t_ns, zero, qd[:, None], zero, zero, tau_x[:, None], np.zeros((len(t_ns), 0), int)
     )
 
 
-def test_least_energy_is_that_of_outside_until_any_instant() -> None:
-    """It puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
+def test_least_energy_counts_energy_from_outside() -> None:
+    """The outside puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
     t_ns = np.arange(3001) * 1_000_000
     power = np.select([t_ns < 1e9, t_ns < 2e9], [3.0, -5.0], 4.0)
     assert find_least_energy(
@@ -276,14 +286,14 @@ def test_least_energy_is_that_of_outside_until_any_instant() -> None:
     assert find_least_energy({"s": batch(t_ns, np.ones(3001), np.zeros(3001))}) == 0.0
 
 
-def test_an_interrupted_confirmation_goes_on(
+def test_an_interrupted_confirmation_resumes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Every run is repeated once over twice its length, and no finished run a second time."""
-    made: list[float] = []
+    repeated: list[float] = []
 
     def run(item: BenchRunItem) -> BenchRun:
-        made.append(item.to_s)
+        repeated.append(item.to_s)
         return make_run(
             item.cell,
             item.seed,
@@ -293,30 +303,34 @@ def test_an_interrupted_confirmation_goes_on(
             to_s=item.to_s,
         )
 
-    shown: list[int] = []
+    counts: list[int] = []
 
     def stop(done: int, _total: int) -> None:
-        shown.append(done)
-        if len(shown) == 4:  # the first of three repetitions
+        counts.append(done)
+        if len(counts) == 4:  # the first of three repetitions
             raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_run, "run_bench_task", run)
-    folder = prepare_bench_folder(asked(), tmp_path / "suite")
+    folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
         run_bench(folder, on=executor, progress=stop)
-    assert made.count(0.0) == 3
-    before = len(made)
+    assert repeated.count(0.0) == 3
+    before = len(repeated)
     with ThreadPoolExecutor(1) as executor:
-        results = run_bench(prepare_bench_folder(asked(), tmp_path / "suite"), on=executor)
-    assert made[before:] == [60.0, 60.0]
-    assert [(one.confirmed, one.length_s) for one in results.runs] == [(True, 60.0)] * 3
+        results = run_bench(
+            prepare_bench_folder(plan_small_suite(), tmp_path / "suite"), on=executor
+        )
+    assert repeated[before:] == [60.0, 60.0]
+    assert [
+        (confirmed_run.confirmed, confirmed_run.length_s) for confirmed_run in results.runs
+    ] == [(True, 60.0)] * 3
 
 
 def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
     """A run of 20 s of two sites that decays slowly."""
     fit = EnvelopeFit(EnvelopeTrend.HARDLY, -0.02)
     facts = {
-        "scenario": asked(links=["rtt8"]).cells[0].build(1).scenario,
+        "scenario": plan_small_suite(links=["rtt8"]).cells[0].build(1).scenario,
         "records": {},
         "end": RunEnd(EndBehaviour.HARDLY, fit, fit, 0.1, 0.1),
         "twins": TwinGrowth(""),
@@ -329,7 +343,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
 
 
 @pytest.mark.parametrize(
-    ("rate_per_s", "length_s", "words"),
+    ("rate_per_s", "length_s", "phrase"),
     [
         (-0.01, 600.0, ""),  # the root, six time constants of 100 s
         (None, 300.0, ""),  # no roots: the envelope, six of 50 s
@@ -337,31 +351,31 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
         (-1.0, 20.0, ""),
     ],
 )
-def test_length_follows_the_slowest_time_constant(
-    rate_per_s: float | None, length_s: float, words: str, monkeypatch: pytest.MonkeyPatch
+def test_run_length_follows_the_slowest_time_constant(
+    rate_per_s: float | None, length_s: float, phrase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    judged = judged_run(rate_per_s)
+    judgement = judged_run(rate_per_s)
     monkeypatch.setattr(
         bench_run,
         "judge_bench_run",
-        lambda scenario, to_s: judged._replace(
+        lambda scenario, to_s: judgement._replace(
             scenario=msgspec.structs.replace(scenario, duration_s=to_s)
         ),
     )
-    longer = lengthen_run(judged)
+    longer = lengthen_run(judgement)
     assert longer.scenario.duration_s == length_s
-    assert words in longer.text
+    assert phrase in longer.text
 
 
-def test_a_decided_run_at_rest_is_long_enough() -> None:
+def test_a_decided_run_at_rest_is_not_extended() -> None:
     fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
     end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
-    judged = judged_run(-0.001, end=end, stability=Stability.SETTLED)
-    assert lengthen_run(judged) is judged
+    judgement = judged_run(-0.001, end=end, stability=Stability.SETTLED)
+    assert lengthen_run(judgement) is judgement
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:
-    cell = asked(links=["rtt8"]).cells[0]
+    cell = plan_small_suite(links=["rtt8"]).cells[0]
     judged = [
         (Stability.STABLE, Stability.STABLE, False),
         (Stability.NOT_STABLE, Stability.NOT_STABLE, True),
@@ -377,10 +391,10 @@ def test_a_longer_run_refutes_or_confirms() -> None:
         assert (found.stability, found.confirmed) == (stability, confirmed)
 
 
-def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = {
-        key: msgspec.structs.replace(one, gains={}) if one.law == "pd_d" else one
-        for key, one in read_gains().items()
+        key: msgspec.structs.replace(gains, gains={}) if gains.law == "pd_d" else gains
+        for key, gains in read_gains().items()
     }
     monkeypatch.setattr(bench_plan, "read_gains", lambda: kept)
     plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
@@ -393,7 +407,7 @@ def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyP
 
 
 def test_laws_of_equal_torque_run_once() -> None:
-    """`six_channel` is `four_channel` with a check of the shares, so it would run the same."""
+    """`six_channel` is `four_channel` with a check of the shares, so both have the same runs."""
     for law, equal in EQUAL_LAWS.items():
         kind, equal_kind = BUILT_IN[law], BUILT_IN[equal]
         assert (kind.torque, kind.begin) == (equal_kind.torque, equal_kind.begin)
@@ -409,14 +423,16 @@ def test_laws_get_nine_tenths_of_gravity() -> None:
         for law in laws[form]:
             reason = explain_no_cell(law, form, "gravity-90")
             assert reason == ("exact model" if law == "impedance" else bench_plan.NO_GAINS)
-    (told,) = plan_bench("full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]).cells
+    (gravity_cell,) = plan_bench(
+        "full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]
+    ).cells
     (exact,) = plan_bench("full", laws=["p_d"], tasks=["free"], links=["rtt68"]).cells
-    assert told.inputs != exact.inputs
-    found = [cell.build(1).scenario.sites["s"].control for cell in (told, exact)]
-    assert [control.gravity for control in found] == [0.9, 1.0]  # type: ignore[attr-defined]
+    assert gravity_cell.inputs != exact.inputs
+    controls = [cell.build(1).scenario.sites["s"].control for cell in (gravity_cell, exact)]
+    assert [control.gravity for control in controls] == [0.9, 1.0]  # type: ignore[attr-defined]
 
 
-def test_a_law_whose_shares_stay_hands_nothing_over() -> None:
+def test_a_law_with_constant_shares_hands_nothing_over() -> None:
     tasks = {cell.task for cell in plan_bench("full", laws=["wave"], links=["rtt68"]).cells}
     assert tasks == TASKS.keys() - {"handover"}
 
@@ -439,8 +455,8 @@ def test_a_run_lasts_for_forty_round_trips() -> None:
 
 
 @pytest.mark.long
-def test_shared_slave_errs_by_its_distance_from_mean_by_dominance() -> None:
-    """After the handover the second user has three quarters; the error is of the present shares."""
+def test_sharing_error_counts_dominance_at_that_time() -> None:
+    """After the handover the second user has three quarters; the error refers to the present shares."""
     plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
     run = run_bench_task(BenchRunItem(plan.cells[0], 1))
     log = trilat_net.simulate(plan.cells[0].build(1).scenario)
@@ -461,53 +477,57 @@ def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
     return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
 
 
-def place(*errors: float | None) -> BenchCellResult:
-    cell = asked().cells[1]
+def make_cell_result(*errors: float | None) -> BenchCellResult:
+    cell = plan_small_suite().cells[1]
     return BenchCellResult(
         cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
     )
 
 
-def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
+def test_intervals_over_twenty_seeds_equal_scipys() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
-    found: Any = place(*errors).compute_mean("error_rad")
+    mean: Any = make_cell_result(*errors).compute_mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
-    assert (found.mean - found.half, found.mean + found.half) == pytest.approx(
+    assert (mean.mean - mean.half, mean.mean + mean.half) == pytest.approx(
         (low, high), rel=1e-12
     )
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
-    assert place(*errors).interval == pytest.approx((share.low, share.high), rel=1e-12)
-    assert place(*errors[:19]).interval is None
-    assert place(*errors[:19]).compute_mean("error_rad") == pytest.approx(
+    assert make_cell_result(*errors).interval == pytest.approx(
+        (share.low, share.high), rel=1e-12
+    )
+    assert make_cell_result(*errors[:19]).interval is None
+    assert make_cell_result(*errors[:19]).compute_mean("error_rad") == pytest.approx(
         np.mean(errors[:19]), rel=1e-12
     )
-    assert place(0.31, None).compute_mean("error_rad") is None
+    assert make_cell_result(0.31, None).compute_mean("error_rad") is None
 
 
 FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
 
 
 @pytest.mark.parametrize("cell", FULL.cells, ids=lambda cell: f"{cell.task}/{cell.law}")
-def test_every_law_fits_every_task_in_which_it_runs(cell: BenchCell) -> None:
-    found = cell.build(1)
-    assert {site.control.__struct_config__.tag for site in found.scenario.sites.values()} == {
-        cell.law
-    }
-    assert len(found.scenario.names) == (2 if cell.form == "two" else 3)
-    assert np.allclose(found.scenario.alpha.sum(axis=1), 1.0)
+def test_every_law_fits_each_of_its_tasks(cell: BenchCell) -> None:
+    experiment = cell.build(1)
+    assert {
+        site.control.__struct_config__.tag for site in experiment.scenario.sites.values()
+    } == {cell.law}
+    assert len(experiment.scenario.names) == (2 if cell.form == "two" else 3)
+    assert np.allclose(experiment.scenario.alpha.sum(axis=1), 1.0)
 
 
 def test_every_link_fits_both_forms() -> None:
     for link in LINKS:
         for form, base in (("three", "_bench_three"), ("two", "_bench_two")):
             scenario = load_scenario(base, build_settings(form, "outage", link))
-            cut = [name for name, one in scenario.links.items() if one.outages_s]
+            cut = [
+                name for name, delayed_link in scenario.links.items() if delayed_link.outages_s
+            ]
             assert sorted(cut) == sorted(
                 name for name in scenario.links if "s" in name.split("->")
             )
 
 
-def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
+def test_all_studies_have_gains_within_their_ranges() -> None:
     gains = read_gains()
     for study in STUDIES.values():
         for form, laws in study.laws.items():
@@ -523,16 +543,16 @@ def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
 
 
 @pytest.mark.long
-def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) -> None:
-    found = tune_laws({"level": ["p_d"]}, 1, budget=4)
-    assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
+def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
+    tuning = tune_laws({"level": ["p_d"]}, 1, budget=4)
+    assert [gains.round_trip_ms for gains in tuning] == list(TUNED_ROUND_TRIPS_MS)
     settings = format_settings(build_settings("level", "contact", "rtt272"))
     (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
     places = [
         n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED
     ]
     places.sort(key=lambda n: search.scores[n].error_rad or 0.0)
-    assert (found[1].settled, found[1].tried) == (len(places), 8)
+    assert (tuning[1].settled, tuning[1].tried) == (len(places), 8)
     later = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
 
     def keeps(place: int) -> bool:
@@ -540,13 +560,13 @@ def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) ->
         return measure_candidate(*longer.texts).outcome is CandidateClass.SETTLED
 
     first = next(place for place in places if keeps(place))
-    assert (found[1].gains, found[1].passed) == (search.tried[first], places.index(first))
-    write_gains(found[:2], tmp_path / "gains.json")
-    write_gains(found[1:], tmp_path / "gains.json")
+    assert (tuning[1].gains, tuning[1].passed) == (search.tried[first], places.index(first))
+    write_gains(tuning[:2], tmp_path / "gains.json")
+    write_gains(tuning[1:], tmp_path / "gains.json")
     assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(
-        map(str, found)
+        map(str, tuning)
     )
-    assert find_stale(found) == []
+    assert find_stale(tuning) == []
 
 
 @pytest.mark.long
@@ -558,7 +578,7 @@ def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) ->
     ],
 )
 def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float]) -> None:
-    """Both end away from the pose of the hand, and are stable by what they promise."""
+    """Both laws end away from the pose of the hand, and are stable by their own promise."""
     base = bench_plan.load_tuning_task("three", law, 68)
     candidate = base.with_gains(SEARCH_SPACES[law], KNOWLEDGE, gains)
     score = measure_candidate(*candidate.texts)
@@ -567,14 +587,14 @@ def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float
     assert score.pose_rad > 0.1
 
 
-def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Gains are stored one by one, and those that are up to date are not tuned again."""
-    path, made = tmp_path / "gains.json", []
+def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Gains are stored one by one, and gains that are up to date are not tuned again."""
+    path, tuned_names = tmp_path / "gains.json", []
 
     def tune(form: str, law: str, round_trip_ms: int, *_: Any) -> TunedGains:
-        if len(made) == 2:
+        if len(tuned_names) == 2:
             raise KeyboardInterrupt
-        made.append(round_trip_ms)
+        tuned_names.append(round_trip_ms)
         mark = fingerprint_tuning(form, law, round_trip_ms)
         return TunedGains(form, law, round_trip_ms, {"K": 1.0}, 1, 1, 0, 0.1, 1.0, mark)
 
@@ -589,21 +609,21 @@ def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
     with pytest.raises(KeyboardInterrupt):
         go_on()
     assert len(read_gains(path)) == 2
-    made.clear()
+    tuned_names.clear()
     assert len(go_on()) == 3
-    assert made == [TUNED_ROUND_TRIPS_MS[-1]]
+    assert tuned_names == [TUNED_ROUND_TRIPS_MS[-1]]
 
 
 class Damped(BUILT_IN["p_d"]):
-    """P+d with twice the damping that it is given."""
+    """P+d with twice the configured damping."""
 
     @classmethod
     def write_control(cls, gains: Any, site: Any) -> dict[str, Any]:
         return super().write_control({**gains, "d": 2.0 * gains["d"]}, site)
 
 
-def test_gains_are_outdated_by_another_motion_alone() -> None:
-    """Neither texts nor names of a law's code matter, but how it moves the arms does."""
+def test_only_another_motion_makes_gains_outdated() -> None:
+    """Texts and names in a law's code do not matter; its motion of the arms does."""
     space = SEARCH_SPACES["p_d"]
     task = bench_plan.load_tuning_task("level", "p_d", 68)
     same = space._replace(kind=type("Renamed", (BUILT_IN["p_d"],), {}))
@@ -613,7 +633,7 @@ def test_gains_are_outdated_by_another_motion_alone() -> None:
 
 
 def list_shipped_gains() -> Iterator[Any]:
-    """Yields all gains that are shipped; every ninth is tried on a push."""
+    """Yields all shipped gains; every ninth is tested on a push."""
     for place, gains in enumerate(read_gains().values()):
         yield pytest.param(
             gains, id=str(gains), marks=() if place % 9 == 0 else pytest.mark.long
@@ -625,7 +645,7 @@ def test_shipped_gains_are_up_to_date(gains: TunedGains) -> None:
     assert find_stale([gains]) == []
 
 
-def test_gains_are_those_of_the_next_longer_round_trip() -> None:
+def test_gains_come_from_the_next_longer_round_trip() -> None:
     assert [choose_round_trip(ms) for ms in (0.0, 68.0, 69.0, 600.0, 5000.0)] == [
         68,
         68,
@@ -636,13 +656,13 @@ def test_gains_are_those_of_the_next_longer_round_trip() -> None:
 
 
 def test_gains_of_another_law_or_scenario_are_stale() -> None:
-    kept = asked().cells[0].tuned
-    other = msgspec.structs.replace(kept, fingerprint="0" * 16)
-    assert find_stale([other]) == [f"p_d (level, {kept.round_trip_ms} ms)"]
+    tuned = plan_small_suite().cells[0].tuned
+    other = msgspec.structs.replace(tuned, fingerprint="0" * 16)
+    assert find_stale([other]) == [f"p_d (level, {tuned.round_trip_ms} ms)"]
 
 
 @pytest.mark.parametrize(
-    ("more", "words"),
+    ("more", "phrase"),
     [
         ({"study": "smal"}, "no study 'smal' is available; did you mean 'small'"),
         ({"laws": ["p_dd"]}, "no law 'p_dd' is available; did you mean"),
@@ -655,28 +675,28 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
         ),
     ],
 )
-def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> None:
+def test_impossible_requests_are_refused(more: dict[str, Any], phrase: str) -> None:
     with pytest.raises(UsageError) as refused:
-        asked(**more)
-    assert words in str(refused.value)
+        plan_small_suite(**more)
+    assert phrase in str(refused.value)
 
 
 @pytest.mark.long
-def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
-    whole: BenchResults, tmp_path: Path
-) -> None:
-    first = run_bench(prepare_bench_folder(asked(links=["rtt8"]), tmp_path / "one"), jobs=1)
-    made: list[int] = []
-    more = run_bench(
-        prepare_bench_folder(asked(), tmp_path / "one"),
-        jobs=1,
-        progress=lambda done, _: made.append(done),
+def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path) -> None:
+    first = run_bench(
+        prepare_bench_folder(plan_small_suite(links=["rtt8"]), tmp_path / "one"), jobs=1
     )
-    assert made == [2, 3]
+    finished: list[int] = []
+    more = run_bench(
+        prepare_bench_folder(plan_small_suite(), tmp_path / "one"),
+        jobs=1,
+        progress=lambda done, _: finished.append(done),
+    )
+    assert finished == [2, 3]
     assert more.runs == whole.runs
     assert more.runs[0] == first.runs[0]
     gains = {"K": 20.0, "d": 5.0}
-    cell = asked().cells[0]
+    cell = plan_small_suite().cells[0]
     other = cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
     changed = BenchPlan("round-trips", [other], [])
     assert (
@@ -688,8 +708,8 @@ def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
     with pytest.raises(
         UsageError, match="results from both cannot be mixed: choose another folder with out"
     ):
-        prepare_bench_folder(asked(), tmp_path / "one")
+        prepare_bench_folder(plan_small_suite(), tmp_path / "one")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()
     with pytest.raises(UsageError, match="is not empty"):
-        prepare_bench_folder(asked(), tmp_path / "full")
+        prepare_bench_folder(plan_small_suite(), tmp_path / "full")

@@ -1,4 +1,4 @@
-"""`trilat bench`: what it prints, what it leaves, what it refuses."""
+"""`trilat bench`: output, files and refusals."""
 
 import csv
 import json
@@ -22,18 +22,18 @@ SOME = (
 )
 
 
-def test_part_of_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
+def test_part_of_suite_leaves_results_and_resumes(tmp_path: Path) -> None:
     done = trilat("bench", *SOME, "--seeds", "2", "--jobs", "1", "--json", cwd=tmp_path)
     assert done.code == 0
     assert "note: 2 cells, 3 runs, into runs/bench-round-trips" in done.err
     facts = json.loads(done.out)
     assert is_documented("bench", facts)
-    assert [place["runs"] for place in facts["places"]] == [1, 2]
+    assert [cell["runs"] for cell in facts["places"]] == [1, 2]
     folder = tmp_path / "runs" / "bench-round-trips"
     with (folder / "places.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [float(row["error_rad"]) for row in rows] == [
-        place["error_rad"] for place in facts["places"]
+        point["error_rad"] for point in facts["places"]
     ]
     page = (folder / "bench.md").read_text()
     assert f"    trilat bench {shlex.join(SOME)} --seeds 2" in page
@@ -58,7 +58,7 @@ def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "facts"),
+    ("arguments", "facts"),
     [
         (("--study", "ful"), ["no study 'ful'", "did you mean 'full'"]),
         (("--law", "adaptiv"), ["no law 'adaptiv'"]),
@@ -67,7 +67,7 @@ def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
         (("--jobs", "2", "--on", "tcp://127.0.0.1:1"), ["--jobs sets the number of processes"]),
     ],
 )
-def test_what_cannot_be_asked_is_refused_in_a_line(
-    words: tuple[str, ...], facts: list[str], tmp_path: Path
+def test_impossible_requests_are_refused_in_a_line(
+    arguments: tuple[str, ...], facts: list[str], tmp_path: Path
 ) -> None:
-    trilat("bench", *words, cwd=tmp_path).refuses(*facts)
+    trilat("bench", *arguments, cwd=tmp_path).refuses(*facts)

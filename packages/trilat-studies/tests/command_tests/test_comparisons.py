@@ -24,7 +24,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
+def test_logs_are_compared_under_their_differing_settings(logs: Path) -> None:
     lines = trilat("compare", "a.mcap", "b.mcap", "--all", cwd=logs).succeeds().splitlines()
     assert next(line.split() for line in lines if "every link" in line)[2:] == [
         "200",
@@ -36,7 +36,7 @@ def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
     assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
 
 
-def test_short_text_has_verdicts_ten_metrics_and_a_conclusion(logs: Path) -> None:
+def test_short_text_has_verdicts_metrics_and_conclusion(logs: Path) -> None:
     files = ("a.mcap", "b.mcap")
     facts = json.loads(trilat("compare", *files, "--json", cwd=logs).succeeds())
     brief = trilat("compare", *files, cwd=logs).succeeds().splitlines()
@@ -55,21 +55,23 @@ def test_short_text_has_verdicts_ten_metrics_and_a_conclusion(logs: Path) -> Non
 
 @pytest.mark.long
 def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
-    printed = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
-    assert "the same experiment" in printed
-    assert "1: a.mcap" in printed
+    output = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
+    assert "the same experiment" in output
+    assert "1: a.mcap" in output
 
 
-def test_logs_of_different_scenarios_are_compared_and_that_is_said(logs: Path) -> None:
-    printed = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
-    assert "logs of different scenarios: free, two_sites" in printed
+def test_comparing_logs_of_different_scenarios_is_reported(logs: Path) -> None:
+    output = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
+    assert "logs of different scenarios: free, two_sites" in output
 
 
 def test_json_is_for_programs(logs: Path) -> None:
     facts = json.loads(trilat("compare", "a.mcap", "hang.mcap", "--json", cwd=logs).succeeds())
     assert facts["columns"] == ["a", "hang"]
     assert [log["scenario"] for log in facts["logs"]] == ["free", "free"]
-    assert {"control", "duration_s"} <= {one["key"] for one in facts["differences"]}
+    assert {"control", "duration_s"} <= {
+        difference["key"] for difference in facts["differences"]
+    }
     hanging = [
         log
         for log, remarks in facts["remarks"].items()
@@ -80,7 +82,7 @@ def test_json_is_for_programs(logs: Path) -> None:
 
 
 @pytest.mark.long
-def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) -> None:
+def test_search_reports_time_and_procedure_and_writes_folder(logs: Path) -> None:
     options = [
         "--law",
         "p_d,known",
@@ -93,10 +95,10 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
         "--out",
         "fronts",
     ]
-    printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
-    assert "18 runs on 1 core: about " in printed
-    assert "torques clamped at 60 N m" in printed
-    assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in printed
+    output = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
+    assert "18 runs on 1 core: about " in output
+    assert "torques clamped at 60 N m" in output
+    assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in output
     written = sorted(path.name for path in (logs / "fronts").iterdir())
     assert written == ["front.json", "front.md", "front.pdf", "front.png"]
     again = trilat(
@@ -139,7 +141,7 @@ def test_bad_input_is_refused_in_one_line(
 
 
 @pytest.mark.long
-def test_a_built_in_law_is_called_by_its_name(tmp_path: Path) -> None:
+def test_a_shipped_law_is_called_by_its_name(tmp_path: Path) -> None:
     for law in ("tdpa", "wave", "adaptive"):
         how = ["--set", f"control.law={law}", "--set", "scheme=digital", "--duration", "0.5"]
         trilat("sim", "two_sites", *how, "-o", f"{law}.mcap", cwd=tmp_path).succeeds()

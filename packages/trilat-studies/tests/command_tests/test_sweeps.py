@@ -1,4 +1,4 @@
-"""`trilat sweep` with `--map`, `--margin`, `--confirm`: what it prints, what it leaves, what it refuses."""
+"""`trilat sweep` with `--map`, `--margin`, `--confirm`: output, files and refusals."""
 
 import json
 import re
@@ -24,7 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Path) -> None:
+def test_a_sweep_prints_plan_outcome_and_next_step(folder: Path, tmp_path: Path) -> None:
     text = trilat("sweep", folder / "trio.toml", *OVER, "--jobs", "1", cwd=tmp_path).succeeds()
     lines = text.splitlines()
     assert lines[0] == "trio: 12 cells (3 x 4), seed 1"
@@ -38,8 +38,8 @@ def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Pa
     again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
     assert verdicts in again
     for line in (line for line in again if line.startswith("  trilat sweep ")):
-        words = line.partition("#")[0].split()
-        trilat(*words[1:], "--jobs", "1", cwd=tmp_path).succeeds()
+        arguments = line.partition("#")[0].split()
+        trilat(*arguments[1:], "--jobs", "1", cwd=tmp_path).succeeds()
 
 
 def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_finished_sweep_is_not_computed_again(folder: Path) -> None:
     assert (folder / "done" / "results.csv").read_bytes() == before
 
 
-def test_a_folder_that_is_called_as_a_scenario_is_none(folder: Path) -> None:
+def test_a_folder_is_no_scenario(folder: Path) -> None:
     (folder / "free").mkdir(exist_ok=True)
     trilat("sweep", "free", "--over", "control.Kx=1,2", cwd=folder).refuses(
         "free: control.Kx", "did you mean"
@@ -92,14 +92,14 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_what_cannot_be_right_is_one_line_and_leaves_nothing(kind: str, folder: Path) -> None:
+def test_bad_input_is_one_line_without_files(kind: str, folder: Path) -> None:
     before = sorted(folder.rglob("*"))
     arguments, facts = BAD[kind]
     trilat("sweep", "trio.toml", *arguments, cwd=folder).refuses(*facts)
     assert sorted(folder.rglob("*")) == before
 
 
-def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
+def test_enormous_sweeps_are_refused_with_count_and_time(folder: Path) -> None:
     before = sorted(folder.rglob("*"))
     done = trilat(
         "sweep", "trio.toml", "--over", "control.Kd=1:2:1e-6", "--over", OVER[1], cwd=folder
@@ -111,14 +111,14 @@ def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
     assert sorted(folder.rglob("*")) == before
 
 
-def test_map_lies_beside_results_and_names_command_that_makes_it(folder: Path) -> None:
+def test_map_lies_beside_results_and_names_its_command(folder: Path) -> None:
     names = sorted(path.name for path in (folder / "done").iterdir())
     assert {"map.md", "map.png", "map.svg", "results.csv"} <= set(names)
     text = (folder / "done" / "map.md").read_text()
     assert f"trilat sweep trio.toml {' '.join(OVER)} --map\n" in text
 
 
-def test_a_map_shows_its_progress_and_what_was_fixed(folder: Path) -> None:
+def test_map_shows_progress_and_fixed_settings(folder: Path) -> None:
     lines = (folder / "printed.txt").read_text().splitlines()
     assert lines.index("map: the lines of theory ...") < lines.index("map: drawing ...")
     assert any(
@@ -133,7 +133,7 @@ def test_a_map_shows_its_progress_and_what_was_fixed(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_results_are_drawn_once_more_the_same(folder: Path) -> None:
+def test_redrawn_results_are_the_same(folder: Path) -> None:
     before = {
         name: (folder / "done" / name).read_bytes() for name in ("map.md", "map.png", "map.svg")
     }
@@ -149,20 +149,27 @@ def test_results_are_drawn_once_more_the_same(folder: Path) -> None:
 
 @pytest.mark.long
 def test_margins_are_printed_and_kept(folder: Path) -> None:
-    asked = ("--over", "link.delay_ms=0,40", "--margin", "control.Kd=1:4", "--tolerance", "0.1")
+    arguments = (
+        "--over",
+        "link.delay_ms=0,40",
+        "--margin",
+        "control.Kd=1:4",
+        "--tolerance",
+        "0.1",
+    )
     text = trilat(
-        "sweep", "trio.toml", *asked, "--jobs", "1", "-o", "edges", cwd=folder
+        "sweep", "trio.toml", *arguments, "--jobs", "1", "-o", "edges", cwd=folder
     ).succeeds()
     assert "edge of Kd (N m s/rad)" in text
     facts = json.loads((folder / "edges" / "margin.json").read_text())
-    assert [place["link.delay_ms"] for place in facts["places"]] == [0.0, 40.0]
+    assert [point["link.delay_ms"] for point in facts["places"]] == [0.0, 40.0]
     assert (folder / "edges" / "margin.md").read_text().startswith("# ")
-    words = facts["command"].split()
-    assert words[:3] == ["trilat", "sweep", "trio.toml"]
+    command = facts["command"].split()
+    assert command[:3] == ["trilat", "sweep", "trio.toml"]
 
 
 @pytest.mark.parametrize(
-    ("words", "problem"),
+    ("arguments", "problem"),
     [
         (("done", "--over", "control.Kd=1,2"), "--over is already set by the sweep"),
         (("--resume", "done", "--seeds", "3"), "--seeds is already set by the sweep"),
@@ -188,7 +195,7 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
         (("trio.toml", *OVER, "--margin", "control.Kd=1:4"), "control.Kd: is swept twice"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(
-    folder: Path, words: tuple[str, ...], problem: str
+def test_impossible_requests_are_refused_in_a_sentence(
+    folder: Path, arguments: tuple[str, ...], problem: str
 ) -> None:
-    trilat("sweep", *words, cwd=folder).refuses(problem)
+    trilat("sweep", *arguments, cwd=folder).refuses(problem)

@@ -1,4 +1,4 @@
-"""`trilat test`: exit codes in every direction, what it prints, what it refuses, how Ctrl-C ends it."""
+"""`trilat test`: exit codes in every direction, output, refusals and Ctrl-C."""
 
 import signal
 import sys
@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_holds_is_0_with_a_table(folder: Path) -> None:
+def test_met_expectations_exit_0_with_a_table(folder: Path) -> None:
     text = trilat(
         "test", "./quick.toml", "--seeds", "1..3", "--jobs", "1", cwd=folder
     ).succeeds()
@@ -34,7 +34,7 @@ def test_what_holds_is_0_with_a_table(folder: Path) -> None:
     assert "3 runs, 1.5 s simulated in " in text
 
 
-def test_a_failed_expectation_is_1_with_commands_that_repeat_it(folder: Path) -> None:
+def test_failed_expectations_exit_1_with_their_commands(folder: Path) -> None:
     done = trilat(
         "test", "./quick.toml", "--seeds", "4,6", "--jobs", "1", *TOO_MUCH, cwd=folder
     )
@@ -54,7 +54,7 @@ def test_a_failed_expectation_is_1_with_commands_that_repeat_it(folder: Path) ->
     assert (folder / "quick-seed6.mcap").exists()
 
 
-def test_one_scenario_that_fails_among_others_is_1(folder: Path) -> None:
+def test_one_failing_scenario_among_others_exits_1(folder: Path) -> None:
     (folder / "bad.toml").write_text(QUICK.replace("100.0", "1.0"))
     done = trilat("test", "./quick.toml", "./bad.toml", "--jobs", "1", cwd=folder)
     assert done.code == 1, done
@@ -62,7 +62,7 @@ def test_one_scenario_that_fails_among_others_is_1(folder: Path) -> None:
     assert marks == ["ok  ", "ok  ", "ok  ", "FAIL"]
 
 
-def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
+def test_junit_is_written_for_any_outcome(folder: Path) -> None:
     command = ("test", "./quick.toml", "--seeds", "1..2", "--jobs", "1", "--junit", "o.xml")
     for more, failures in (((), "0"), (TOO_MUCH, "2")):
         trilat(*command, *more, cwd=folder)
@@ -71,7 +71,7 @@ def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ("./missing.toml", "missing.toml"),
         ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
@@ -82,12 +82,12 @@ def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
         ("./mute.toml", "[expect]"),
     ],
 )
-def test_bad_input_is_2_before_anything_runs(words: tuple[str, ...], folder: Path) -> None:
+def test_bad_input_exits_2_before_any_run(arguments: tuple[str, ...], folder: Path) -> None:
     (folder / "mute.toml").write_text(QUICK.partition("[expect]")[0])
-    trilat("test", *words[:-1], cwd=folder).refuses(words[-1])
+    trilat("test", *arguments[:-1], cwd=folder).refuses(arguments[-1])
 
 
-def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
+def test_default_is_every_shipped_scenario_with_expectations() -> None:
     from trilat_studies.study_commands import _list_trials
 
     named = [trial.source for trial in _list_trials([], [1, 2], [], live=False)]
@@ -117,7 +117,7 @@ def test_other_texts_name_no_seeds(text: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
+def test_ctrl_c_exits_130_and_leaves_no_process(folder: Path) -> None:
     (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))
     process = started("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
 

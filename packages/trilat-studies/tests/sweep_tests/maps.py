@@ -1,4 +1,4 @@
-"""Results of sweeps that were never run, for tests of what is drawn of them."""
+"""Results of sweeps that were never run, for tests of drawings."""
 
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -18,12 +18,12 @@ Row = dict[str, Any]
 Judge = Callable[..., CellClass]
 
 
-def by_the_line(delay_ms: float, d: float, *_: Any) -> CellClass:
-    """What the condition of P+d says of K = 10 and three sites."""
+def judge_by_condition(delay_ms: float, d: float, *_: Any) -> CellClass:
+    """Returns the verdict of P+d's condition for K = 10 and three sites."""
     return CellClass.CONVERGED if d > 5e-3 * delay_ms else CellClass.BOUNDED
 
 
-def rows(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> Iterator[Row]:
+def rows(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> Iterator[Row]:
     """Yields one row per place and seed, judged by a function of its values and its seed."""
     every = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS} | {
         key.replace("__", "."): some for key, some in axes.items()
@@ -42,7 +42,7 @@ def rows(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> Iterator[
             }
 
 
-def drawn(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> MapPlane:
-    """Returns the plane of such rows."""
-    made = list(rows(verdict, seeds, **axes))
-    return build_plane(made, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)
+def make_plane(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> MapPlane:
+    """Returns the plane of these rows."""
+    all_rows = list(rows(verdict, seeds, **axes))
+    return build_plane(all_rows, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)

@@ -1,4 +1,4 @@
-"""Sweeps that take milliseconds: three sites, half a second, 100 Hz; and a judge that only reads."""
+"""Sweeps that take milliseconds (three sites, half a second, 100 Hz), and a judge that only reads texts."""
 
 import hashlib
 from pathlib import Path
@@ -14,8 +14,8 @@ DELAYS = "link.delay_ms=0:40:20"
 DAMPING = "control.Kd=1:4:1"
 
 
-def asked(folder: Path, *overrides: str, **settings: object) -> SweepPlan:
-    """A sweep of that scenario, as a file."""
+def plan_quick_sweep(folder: Path, *overrides: str, **settings: object) -> SweepPlan:
+    """Returns a request for a sweep of the quick scenario, as a file."""
     path = folder / "trio.toml"
     if not path.exists():
         path.write_text(SHORT)
@@ -23,7 +23,7 @@ def asked(folder: Path, *overrides: str, **settings: object) -> SweepPlan:
 
 
 class Judge:
-    """Stands for the judge: outcomes are a function of the text; remembers what it was asked."""
+    """Stands for the judge: outcomes are a function of the text, and every question is kept."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -34,7 +34,7 @@ class Judge:
 
 
 def outcome_of(text: str, longest_s: float = 4.0) -> CellResult:
-    """Some outcome, another one for nearly every text."""
+    """Returns an outcome that differs for nearly every text."""
     digest = hashlib.sha256(text.encode()).digest()
     number = int.from_bytes(digest[:6], "big") / 2**48
     verdict = list(CellClass)[digest[7] % 4]

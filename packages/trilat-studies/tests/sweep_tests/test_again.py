@@ -1,4 +1,4 @@
-"""A cell as a log: the printed command makes the very run that was judged."""
+"""A cell as a log: the printed command repeats exactly the judged run."""
 
 import shlex
 from pathlib import Path
@@ -14,38 +14,40 @@ from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
 
-from .quick import SHORT, asked
+from .quick import SHORT, plan_quick_sweep
 
 AT_REST_OR_LOST = ("limits.qd_limit_rad_s=6", "link.loss=0.1")
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
-    """Cells that settle, that are extended, and that diverge."""
+    """Returns cells that settle, that are extended, and that diverge."""
     path = tmp_path_factory.mktemp("again")
     over = ["control.d=0.1,1,8", "link.delay_ms=0,400"]
-    sweep = asked(path, "control.law=p_d", "control.K=40", *AT_REST_OR_LOST, over=over)
+    sweep = plan_quick_sweep(
+        path, "control.law=p_d", "control.K=40", *AT_REST_OR_LOST, over=over
+    )
     return run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results
 
 
-def test_command_of_cell_makes_its_numbers_bit_for_bit(
+def test_command_of_cell_gives_its_numbers_bitwise(
     results: SweepResults, tmp_path: Path
 ) -> None:
     assert any(row["diverged_s"] is not None for row in results.rows)
     assert any(row["extended"] for row in results.rows)
     for row in results.rows:
         command, note = build_reproduce_command(results, row, tmp_path)
-        words = shlex.split(command)
-        done = trilat(*words[1:], cwd=tmp_path)
+        arguments = shlex.split(command)
+        done = trilat(*arguments[1:], cwd=tmp_path)
         outcome = results.outcome(row)
         assert done.code == (0 if outcome.diverged_s is None else 1), done
-        log = open_log(tmp_path / words[-1])
-        seen = classify_log_end(log)
-        assert seen.end_error_rad == outcome.end_error_rad
-        assert seen.end_speed_rad_s == outcome.end_speed_rad_s
+        log = open_log(tmp_path / arguments[-1])
+        run_end = classify_log_end(log)
+        assert run_end.end_error_rad == outcome.end_error_rad
+        assert run_end.end_speed_rad_s == outcome.end_speed_rad_s
         stability = certify_run(log).stability
         assert outcome.stability == stability
-        assert classify_decision(stability, seen.behaviour) is outcome.verdict
+        assert classify_decision(stability, run_end.behaviour) is outcome.verdict
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
         ended_s = max(float(log[name].t_s[-1]) for name in log.sites)
@@ -54,9 +56,7 @@ def test_command_of_cell_makes_its_numbers_bit_for_bit(
         assert (note, row["command"]) == ("", command)
 
 
-def test_where_the_scenario_has_changed_the_rows_own_is_named(
-    results: SweepResults, tmp_path: Path
-) -> None:
+def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: Path) -> None:
     source = Path(results.plan.written.label)
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
@@ -66,8 +66,8 @@ def test_where_the_scenario_has_changed_the_rows_own_is_named(
         source.write_text(SHORT)
     assert "has changed since the sweep" in note
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
-    words = shlex.split(command)
-    trilat(*words[1:], cwd=tmp_path)
+    arguments = shlex.split(command)
+    trilat(*arguments[1:], cwd=tmp_path)
     assert (
         classify_log_end(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad
         == row["end_error_rad"]

@@ -1,4 +1,4 @@
-"""One run: what its command makes is what was judged, and its text is kept as what differs."""
+"""One run: its command repeats the judged run, and its text is kept as a difference."""
 
 import json
 import pickle
@@ -13,7 +13,7 @@ from trilat_studies.sweep.sweep_cell import apply_diff, diff_lines
 from trilat_studies.sweep.sweep_results import build_sim_command
 from trilat_studies.sweep.sweep_run import CellItem, run_cell
 
-from sweep_tests.quick import Judge, asked
+from sweep_tests.quick import Judge, plan_quick_sweep
 from trilat_net.app.cli.options import load_chosen_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -21,48 +21,52 @@ from trilat_net.scenario import load_scenario, parse_scenario
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
-    found = Judge()
-    monkeypatch.setattr(sweep_cell, "classify_cell", found)
-    return found
+    text_judge = Judge()
+    monkeypatch.setattr(sweep_cell, "classify_cell", text_judge)
+    return text_judge
 
 
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
-    plan = asked(tmp_path, "link.loss=0.1", seeds=2)
+    plan = plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=2)
     entry = run_cell(CellItem(plan, plan.cell(5), 2))
     (text,) = judge.texts
     assert apply_diff(entry.scenario, plan.base.text) == text
     assert entry.outcome == judge(text, plan.longest_s)
     assert (entry.cell, entry.seed, entry.random, entry.law) == (5, 2, True, "adaptive")
-    same = asked(tmp_path)
+    same = plan_quick_sweep(tmp_path)
     assert not run_cell(CellItem(same, same.cell(5), 1)).random
 
 
-def test_command_of_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
-    plan = asked(
+def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Judge) -> None:
+    plan = plan_quick_sweep(
         tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
     )
     run_cell(CellItem(plan, plan.cell(1), 1))
-    words = shlex.split(build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))
-    assert words[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
-    assert words[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
-    settings = words[3:-6]
+    arguments = shlex.split(
+        build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap")
+    )
+    assert arguments[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
+    assert arguments[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
+    settings = arguments[3:-6]
     assert settings[::2] == ["--set"] * (len(settings) // 2)
-    assert load_chosen_scenario(words[2], settings[1::2], 0.25, 1).text == judge.texts[0]
+    assert load_chosen_scenario(arguments[2], settings[1::2], 0.25, 1).text == judge.texts[0]
 
 
 @pytest.mark.usefixtures("judge")
-def test_a_task_makes_the_same_entry_in_another_process(tmp_path: Path) -> None:
-    plan = asked(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
+def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
+    plan = plan_quick_sweep(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
     task = CellItem(plan, plan.cell(3), 1)
-    sent = pickle.loads(pickle.dumps(task))
-    assert run_cell(sent) == run_cell(task)
+    restored_task = pickle.loads(pickle.dumps(task))
+    assert run_cell(restored_task) == run_cell(task)
     assert (
-        parse_scenario(apply_diff(run_cell(sent).scenario, plan.base.text)).sites["s"].control.K
+        parse_scenario(apply_diff(run_cell(restored_task).scenario, plan.base.text))
+        .sites["s"]
+        .control.K
     )
 
 
-def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
-    plan = asked(tmp_path)
+def test_a_cell_without_valid_scenario_is_named(tmp_path: Path) -> None:
+    plan = plan_quick_sweep(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
     with pytest.raises(
         ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"
@@ -74,7 +78,7 @@ texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)
 
 
 @given(text=texts, base=texts)
-def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: str) -> None:
+def test_a_text_is_restored_whatever_its_reference(text: str, base: str) -> None:
     parts = diff_lines(text, base)
     assert apply_diff(parts, base) == text
     assert apply_diff(json.loads(json.dumps(parts)), base) == text
@@ -83,15 +87,15 @@ def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: st
 @given(
     text=texts, line=st.integers(0, 10), other=st.text(alphabet="xy", min_size=1, max_size=5)
 )
-def test_a_line_that_was_changed_is_all_that_differs(text: str, line: int, other: str) -> None:
+def test_only_the_changed_line_differs(text: str, line: int, other: str) -> None:
     lines = text.split("\n")
     lines[line % len(lines)] = other
-    own = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]
-    assert own in ([other], [])
+    parts = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]
+    assert parts in ([other], [])
 
 
 def test_a_scenario_differs_in_what_an_override_changed() -> None:
     base = load_scenario("p_d_margin")
     changed = load_scenario("p_d_margin", ["sites.m1.control.d=2.5", "seed=7"])
-    own = [part for part in diff_lines(changed.text, base.text) if isinstance(part, str)]
-    assert own == ["seed = 7", "d = [2.5, 2.5]"]
+    parts = [part for part in diff_lines(changed.text, base.text) if isinstance(part, str)]
+    assert parts == ["seed = 7", "d = [2.5, 2.5]"]

@@ -1,4 +1,4 @@
-"""Theory on a map: conditions in closed form, lines column by column, and neither from the runs."""
+"""Theory on a map: conditions in closed form and lines column by column, both independent of the runs."""
 
 from dataclasses import replace
 from functools import partial
@@ -51,33 +51,33 @@ def results(**axes: tuple[object, ...]) -> SweepResults:
 
 
 def test_every_panel_has_its_own_lines() -> None:
-    """Play-out of 400 ms asks for d = 2 whatever the delay."""
-    made = build_stability_map(
+    """Play-out of 400 ms requires d = 2 whatever the delay."""
+    stability_map = build_stability_map(
         results(link__playout_ms=(0.0, 400.0)), ("trilat sweep",), linearly=False
     )
-    (direct,), (played,) = made.lines
-    y = made.plane.y
+    (direct,), (played,) = stability_map.lines
+    y = stability_map.plane.y
     assert np.allclose(
         [direct.crossings(n, y) for n in range(1, 5)], [[0.5], [1.0], [1.5], [2.0]]
     )
     assert np.allclose([played.crossings(n, y) for n in range(5)], 2.0)
-    assert made.remarks == ()
+    assert stability_map.remarks == ()
 
 
 @pytest.mark.long
 def test_lines_depend_on_neither_runs_nor_processes() -> None:
     everything = results()
-    one = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
+    fewer = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
     (closed, rooted), (again, other) = (
         build_stability_map(some, (), jobs).lines[0]
-        for some, jobs in ((everything, 1), (one, 2))
+        for some, jobs in ((everything, 1), (fewer, 2))
     )
     assert (closed.rank, rooted.rank) == (0, 1)
     assert np.array_equal(closed.excess, again.excess)
     assert np.array_equal(rooted.excess, other.excess)
 
 
-def test_for_short_delays_p_d_has_its_condition_as_line() -> None:
+def test_short_delays_have_the_condition_as_line() -> None:
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
     at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
@@ -90,8 +90,8 @@ def test_for_short_delays_p_d_has_its_condition_as_line() -> None:
 
 
 @pytest.mark.long
-def test_coarse_map_has_line_of_linear_analysis_to_its_digits() -> None:
-    """Another mode is the rightmost one from 0.6 on: straight between 0.2 and 0.7 the line were at 0.593."""
+def test_coarse_map_has_the_exact_linear_line() -> None:
+    """From 0.6 on another mode is the rightmost; a straight line between 0.2 and 0.7 would pass 0.593."""
     at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
     scenarios = [at(100.0, d) for d in damping.values]
@@ -109,42 +109,40 @@ def test_coarse_map_has_line_of_linear_analysis_to_its_digits() -> None:
 
 
 def test_a_strip_has_no_lines() -> None:
-    asked = plan_sweep("p_d_margin", over=OVER[:1])
-    made = [row for row in rows() if row["control.d"] == 0.7]
-    assert build_stability_map(SweepResults(asked, made), ()).lines == ((),)
+    plan = plan_sweep("p_d_margin", over=OVER[:1])
+    rows_of_strip = [row for row in rows() if row["control.d"] == 0.7]
+    assert build_stability_map(SweepResults(plan, rows_of_strip), ()).lines == ((),)
 
 
 def test_place_of_panel_is_cell_of_plan() -> None:
-    """What lines are drawn for is what runs: every cell's scenario, with every law."""
-    asked = plan_sweep(
-        "p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d")
-    )
-    made = []
+    """Lines belong to the scenarios that run: every cell's scenario, with every law."""
+    plan = plan_sweep("p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d"))
+    rows_by_panel = []
     for law, row in product(("p_d", "pd_d"), rows(link__playout_ms=(0.0, 400.0))):
-        made.append({**row, "law": law})
-    drawn = build_stability_map(SweepResults(asked, made), (), linearly=False).plane
-    assert [panel.title for panel in drawn.panels] == [
+        rows_by_panel.append({**row, "law": law})
+    plane = build_stability_map(SweepResults(plan, rows_by_panel), (), linearly=False).plane
+    assert [panel.title for panel in plane.panels] == [
         f"{law}, playout {ms} ms" for law in ("p_d", "pd_d") for ms in (0, 400)
     ]
-    for n in range(0, asked.cells, 7):
-        cell = asked.cell(n)
+    for n in range(0, plan.cells, 7):
+        cell = plan.cell(n)
         playout = cell.values[2]
         (panel,) = (
             p
-            for p in drawn.panels
+            for p in plane.panels
             if p.settings == (("law", cell.law), ("link.playout_ms", playout))
         )
-        at = make_panel_loader(asked, panel, drawn.x.key, drawn.y.key)
+        at = make_panel_loader(plan, panel, plane.x.key, plane.y.key)
         delay, damping = cell.values[:2]
         assert isinstance(delay, float)
         assert isinstance(damping, float)
-        assert at(delay, damping) == asked.scenario(*cell.overrides)
+        assert at(delay, damping) == plan.scenario(*cell.overrides)
 
 
 @pytest.mark.parametrize(
     ("value", "text"), [(100.0, "100"), (0.3, "0.3"), (5, "5"), (1e-7, "1e-07"), (-2.5, "-2.5")]
 )
-def test_a_number_as_an_override_is_just_that_number(value: float, text: str) -> None:
+def test_a_numeric_override_is_that_number(value: float, text: str) -> None:
     assert format_override_value(value) == text
     assert float(format_override_value(value)) == value
     assert format_override("a.b", value) == f"a.b={text}"
@@ -164,13 +162,13 @@ def spare(excess: float) -> StabilityCriterion:
     return StabilityCriterion("", "", "", excess)
 
 
-def test_line_of_p_d_is_half_of_stiffness_times_delay() -> None:
+def test_the_line_is_half_stiffness_times_delay() -> None:
     """No d of the map is little enough for no delay, or enough for 800 ms."""
     line = trace_closed_form(at, DELAY, DAMPING)
     assert line is not None
-    found = [line.crossings(column, DAMPING) for column in range(6)]
-    assert [len(some) for some in found] == [0, 1, 1, 1, 1, 0]
-    assert np.allclose([some[0] for some in found[1:5]], [0.5, 1.0, 1.5, 2.0], rtol=1e-9)
+    crossings = [line.crossings(column, DAMPING) for column in range(6)]
+    assert [len(some) for some in crossings] == [0, 1, 1, 1, 1, 0]
+    assert np.allclose([some[0] for some in crossings[1:5]], [0.5, 1.0, 1.5, 2.0], rtol=1e-9)
     assert (line.excess > 0.0)[-1, 0]
     assert not (line.excess > 0.0)[0, -1]
 
@@ -184,7 +182,7 @@ def test_a_law_without_a_condition_has_no_line() -> None:
     )
 
 
-def test_condition_that_nothing_of_map_changes_has_no_line() -> None:
+def test_an_unaffected_condition_has_no_line() -> None:
     assert (
         trace_closed_form(
             lambda x, _: load_scenario(P_D, {"link.delay_ms": x, "control.d": 9.0}),
@@ -196,19 +194,17 @@ def test_condition_that_nothing_of_map_changes_has_no_line() -> None:
 
 
 @given(st.floats(-50.0, 50.0), st.floats(1.0, 3.0), st.sampled_from([-1.0, 1.0]))
-def test_a_condition_is_met_where_it_has_nothing_to_spare(
-    root: float, power: float, sign: float
-) -> None:
+def test_a_condition_holds_without_any_reserve(root: float, power: float, sign: float) -> None:
     def condition(value: float) -> StabilityCriterion:
         gap = value - root
         return spare(sign * float(np.sign(gap)) * abs(gap) ** power)
 
-    found = find_criterion_edge(condition, -60.0, 60.0)
-    assert found is not None
-    assert abs(condition(found).excess) <= 1e-5 * 120.0**power
+    edge = find_criterion_edge(condition, -60.0, 60.0)
+    assert edge is not None
+    assert abs(condition(edge).excess) <= 1e-5 * 120.0**power
 
 
-def test_a_key_of_whole_numbers_has_no_point_between_them() -> None:
+def test_whole_number_keys_have_no_points_between() -> None:
     def condition(value: float) -> StabilityCriterion:
         if value != round(value):
             raise ScenarioError("is a whole number")
@@ -222,7 +218,7 @@ def grows(growth_per_s: list[float], edges: dict[int, float] | None = None) -> G
 
 
 def test_the_linear_line_is_where_nothing_grows() -> None:
-    """Real parts that are zero along y = 0.4 x: positive below, negative above."""
+    """Real parts vanish along y = 0.4 x: positive below, negative above."""
     side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
     columns = [grows([0.4 * x - y for y in side.values]) for x in (0.0, 1.0, 2.0, 3.0)]
     line, remarks = trace_linear_analysis(columns, side)
@@ -242,9 +238,7 @@ def test_a_column_may_be_crossed_again_and_again() -> None:
 
 
 @given(st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6), st.sampled_from([-1.0, 1.0]))
-def test_column_is_crossed_at_its_edges_however_near_they_are(
-    shares: list[float], sign: float
-) -> None:
+def test_columns_are_crossed_at_edges_however_close(shares: list[float], sign: float) -> None:
     side = PlaneAxis("y", tuple(map(float, range(len(shares) + 1))), "y")
     edges = {n: n + share for n, share in enumerate(shares)}
     column = grows([sign * (-1.0) ** n for n in range(len(shares) + 1)], edges)
@@ -253,7 +247,7 @@ def test_column_is_crossed_at_its_edges_however_near_they_are(
     assert line.crossings(0, side) == pytest.approx([*edges.values()], abs=1e-6)
 
 
-def test_nothing_that_moves_is_not_infinitely_stable_and_no_crossing() -> None:
+def test_without_motion_no_line_is_crossed() -> None:
     side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
     line, _ = trace_linear_analysis(
         [grows([-np.inf, 1.0, -1.0]), grows([np.nan, 1.0, -1.0])], side
@@ -262,7 +256,7 @@ def test_nothing_that_moves_is_not_infinitely_stable_and_no_crossing() -> None:
     assert line.crossings(0, side) == line.crossings(1, side) == [1.5]
 
 
-def test_where_nothing_changes_there_is_no_line() -> None:
+def test_without_change_there_is_no_line() -> None:
     why = ["nobody knows the delay"]
     side = PlaneAxis("y", (0.0, 1.0), "y")
     line, remarks = trace_linear_analysis([GrowthColumn([np.nan, np.nan], {}, why)] * 2, side)
@@ -276,24 +270,22 @@ DELAY_MS = st.integers(2, 5000)  # of one tick the sampling asks for more
 
 
 def excess(scenario: Scenario) -> float:
-    found = evaluate_criterion(scenario)
-    assert found is not None
-    return found.excess
+    criterion = evaluate_criterion(scenario)
+    assert criterion is not None
+    return criterion.excess
 
 
 @given(GAIN, GAIN, DELAY_MS)
-def test_equal_sites_ask_for_half_of_stiffness_times_delay(
-    K: float, d: float, delay_ms: int
-) -> None:
+def test_equal_sites_need_half_stiffness_times_delay(K: float, d: float, delay_ms: int) -> None:
     """Three sites with equal shares: the least eigenvalue of alpha is -1/2."""
-    one = load_scenario(
+    scenario = load_scenario(
         "p_d_margin", {"control.K": K, "control.d": d, "link.delay_ms": delay_ms}
     )
-    assert excess(one) == pytest.approx(d - 0.5 * K * delay_ms / 1e3, abs=1e-9)
+    assert excess(scenario) == pytest.approx(d - 0.5 * K * delay_ms / 1e3, abs=1e-9)
 
 
 @given(GAIN, GAIN, GAIN, GAIN, DELAY_MS, DELAY_MS)
-def test_two_sites_are_judged_by_sign_of_general_condition(
+def test_the_general_conditions_sign_judges_two_sites(
     K1: float, K2: float, d1: float, d2: float, there_ms: int, back_ms: int
 ) -> None:
     names = load_scenario("p_d_margin_two").names
@@ -310,15 +302,15 @@ def test_two_sites_are_judged_by_sign_of_general_condition(
         assert np.sign(excess(load_scenario("p_d_margin_two", settings))) == np.sign(margin)
 
 
-def test_of_two_equal_sites_both_conditions_are_one() -> None:
+def test_for_two_equal_sites_both_conditions_agree() -> None:
     """N = 2: abs(lambda_min) = 1, d = K T."""
-    one = load_scenario(
+    scenario = load_scenario(
         "p_d_margin_two", {"control.d": 2.0, "control.K": 10.0, "link.delay_ms": 200.0}
     )
-    assert excess(one) == pytest.approx(0.0, abs=1e-12)
+    assert excess(scenario) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_digital_scheme_rests_on_gravity_learnt_slower_than_tick_allows() -> None:
+def test_digital_scheme_needs_gravity_learnt_slowly_enough() -> None:
     settings = {"scheme": "digital", "link.delay_ms": 0.0, "rate_hz": 100, "control.Gamma": 1.0}
     assert excess(load_scenario("paper", settings)) == pytest.approx(1.0 - 9.81**2 / 100)
     gravity = {**settings, "control.Gamma": [9.0, 9.0, 9.0, 1.0, 1.0]}
@@ -347,7 +339,7 @@ def test_digital_scheme_rests_on_gravity_learnt_slower_than_tick_allows() -> Non
         ("contact", {}),
     ],
 )
-def test_where_its_premises_do_not_hold_a_condition_says_nothing(
+def test_without_its_premises_a_condition_says_nothing(
     name: str, settings: dict[str, Any]
 ) -> None:
     assert evaluate_criterion(load_scenario(name, settings)) is None
@@ -364,11 +356,11 @@ def test_play_out_counts_as_delay() -> None:
     [{"scheme": "digital"}, {"sites.s.rate_hz": 500}, {"control.d": 70.0}],
     ids=["another scheme", "two rates", "d h above the least inertia"],
 )
-def test_a_condition_says_nothing_at_other_tick_rates(changes: dict[str, Any]) -> None:
+def test_a_condition_is_silent_at_other_tick_rates(changes: dict[str, Any]) -> None:
     assert evaluate_criterion(load_scenario("p_d_margin", changes)) is None
 
 
-def test_shares_in_a_circle_have_complex_roots_and_no_line() -> None:
+def test_shares_in_a_circle_have_no_line() -> None:
     circle = {f"dominance.{a}": {b: 1.0} for a, b in (("m1", "m2"), ("m2", "s"), ("s", "m1"))}
     assert evaluate_criterion(load_scenario("p_d_margin", circle)) is None
 

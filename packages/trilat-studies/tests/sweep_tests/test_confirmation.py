@@ -1,4 +1,4 @@
-"""Cells beside edges, run once more: which are taken, and what counts as the same."""
+"""Confirmation of cells beside edges by live runs: the choice of cells, and which verdicts are equal."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from trilat_net.errors import UsageError
 from trilat_net.execution import virtual
 from trilat_net.scenario import Scenario, load_scenario
 
-from .maps import KEYS, Row, by_the_line, rows
+from .maps import KEYS, Row, judge_by_condition, rows
 
 BRIEF = {"link.delay_ms": 0.0, "rate_hz": 200, "duration_s": 12.0}
 CALM = load_scenario("p_d_margin", {**BRIEF, "control.d": 4.0})
@@ -29,7 +29,7 @@ WILD = load_scenario(
 
 
 def cell(scenario: Scenario) -> Row:
-    """A cell's row, as its own run makes it."""
+    """Returns a cell's row as its own run makes it."""
     outcome = sweep_cell.classify_cell(scenario.text, scenario.duration_s)
     return {
         "cell": 3,
@@ -44,7 +44,7 @@ def cell(scenario: Scenario) -> Row:
 
 
 def runner(folder: Path, *problems: str, instead: Scenario | None = None) -> SessionRunner:
-    """A network that is none: sessions are runs in virtual time."""
+    """Stands for the network: sessions are runs in virtual time."""
 
     def run(scenario: Scenario, name: str) -> tuple[Path, Sequence[str]]:
         log = folder / f"{name}.mcap"
@@ -56,45 +56,52 @@ def runner(folder: Path, *problems: str, instead: Scenario | None = None) -> Ses
 
 
 @pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
-def test_a_log_of_the_same_run_has_the_same_verdict(scenario: Scenario, tmp_path: Path) -> None:
+def test_equal_runs_have_equal_verdicts(scenario: Scenario, tmp_path: Path) -> None:
     row = cell(scenario)
-    found = confirm_cell(row, runner(tmp_path))
-    assert found.same
-    assert found.live is found.virtual is CellClass(row["verdict"])
-    assert found.log == tmp_path / "cell-3.mcap"
+    confirmation = confirm_cell(row, runner(tmp_path))
+    assert confirmation.same
+    assert confirmation.live is confirmation.virtual is CellClass(row["verdict"])
+    assert confirmation.log == tmp_path / "cell-3.mcap"
 
 
-def test_another_run_differs(tmp_path: Path) -> None:
-    found = confirm_cell(cell(CALM), runner(tmp_path, instead=WILD))
-    assert not found.same
-    assert (found.virtual, found.live) == (CellClass.CONVERGED, CellClass.DIVERGED)
+def test_different_runs_have_different_verdicts(tmp_path: Path) -> None:
+    confirmation = confirm_cell(cell(CALM), runner(tmp_path, instead=WILD))
+    assert not confirmation.same
+    assert (confirmation.virtual, confirmation.live) == (
+        CellClass.CONVERGED,
+        CellClass.DIVERGED,
+    )
 
 
-def test_a_session_is_as_long_as_the_cell_ran(tmp_path: Path) -> None:
-    """Also where the cell had been extended; one that diverged has half a second more, to get there."""
-    asked: list[float] = []
+def test_a_session_lasts_as_long_as_its_cell(tmp_path: Path) -> None:
+    """This also holds for an extended cell; a diverged cell has half a second more in order to diverge."""
+    durations_s: list[float] = []
 
     def run(scenario: Scenario, _: str) -> tuple[Path, Sequence[str]]:
-        asked.append(scenario.duration_s)
+        durations_s.append(scenario.duration_s)
         return tmp_path / "none.mcap", ["failed"]
 
     for changes in ({"ran_s": 8.0}, {"ran_s": 2.5, "diverged_s": 2.5}):
         confirm_cell({**cell(CALM), **changes}, run)
-    assert asked == [8.0, 3.0]
+    assert durations_s == [8.0, 3.0]
 
 
-def test_what_failed_confirms_nothing(tmp_path: Path) -> None:
+def test_a_failed_run_confirms_nothing(tmp_path: Path) -> None:
     row = cell(CALM)
-    found = confirm_cell(row, runner(tmp_path, "s was killed by SIGKILL"))
-    assert (found.same, found.live, found.text) == (False, None, "s was killed by SIGKILL")
+    confirmation = confirm_cell(row, runner(tmp_path, "s was killed by SIGKILL"))
+    assert (confirmation.same, confirmation.live, confirmation.text) == (
+        False,
+        None,
+        "s was killed by SIGKILL",
+    )
 
     def torn(_: Scenario, name: str) -> tuple[Path, Sequence[str]]:
         (tmp_path / name).write_bytes(b"no log")
         return tmp_path / name, []
 
-    found = confirm_cell(row, torn)
-    assert (found.same, found.live) == (False, None)
-    assert "cell-3" in found.text
+    confirmation = confirm_cell(row, torn)
+    assert (confirmation.same, confirmation.live) == (False, None)
+    assert "cell-3" in confirmation.text
     missing = confirm_cell(row, lambda *_, **__: (tmp_path / "missing.mcap", []))
     assert (missing.same, missing.log) == (False, None)
 
@@ -103,36 +110,38 @@ def stable(row: Row) -> bool | None:
     return CellClass(row["verdict"]).stable
 
 
-def test_cells_are_beside_an_edge_as_many_on_either_side() -> None:
-    every = list(rows())
-    found = choose_cells_near_edges(every, KEYS, 3)
-    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
-    assert len({row["cell"] for row in found}) == 6
-    for row in found:
+def test_equally_many_cells_lie_on_either_side() -> None:
+    all_rows = list(rows())
+    cells = choose_cells_near_edges(all_rows, KEYS, 3)
+    assert [stable(row) for row in cells] == [True] * 3 + [False] * 3
+    assert len({row["cell"] for row in cells}) == 6
+    for row in cells:
         delay, d = row[KEYS[0]], row[KEYS[1]]
         near = [
             one
-            for one in every
+            for one in all_rows
             if (abs(one[KEYS[0]] - delay), round(abs(one[KEYS[1]] - d), 9))
             in ((100, 0.0), (0, 0.5))
         ]
-        assert any(stable(one) is not stable(row) for one in near)
+        assert any(stable(neighbour) is not stable(row) for neighbour in near)
 
 
 def test_cells_are_spread_over_the_edge() -> None:
-    found = choose_cells_near_edges(list(rows()), KEYS, 2)
-    delays = [row[KEYS[0]] for row in found if stable(row)]
+    cells = choose_cells_near_edges(list(rows()), KEYS, 2)
+    delays = [row[KEYS[0]] for row in cells if stable(row)]
     assert max(delays) - min(delays) >= 300
 
 
-def test_undecided_cells_are_not_run_and_edge_is_beyond_them() -> None:
+def test_undecided_cells_move_the_edge_beyond_them() -> None:
     def band(delay_ms: float, d: float, *_: Any) -> CellClass:
         return (
-            CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
+            CellClass.UNDECIDED
+            if abs(d - 5e-3 * delay_ms) < 0.3
+            else judge_by_condition(delay_ms, d)
         )
 
-    found = choose_cells_near_edges(list(rows(band)), KEYS, 3)
-    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
+    cells = choose_cells_near_edges(list(rows(band)), KEYS, 3)
+    assert [stable(row) for row in cells] == [True] * 3 + [False] * 3
     with pytest.raises(UsageError, match="no edge"):
         choose_cells_near_edges(list(rows(lambda *_, **__: CellClass.UNDECIDED)), KEYS, 1)
 
@@ -155,28 +164,30 @@ def lasting(row: Row, ran_s: Callable[[Row], float]) -> Row:
     return {**row, "ran_s": ran_s(row)}
 
 
-def test_long_cells_are_passed_over_for_the_next_ones() -> None:
-    """Stable cells right at the edge ran long: those a step further are taken."""
+def test_long_cells_give_way_to_the_next() -> None:
+    """Stable cells right at the edge ran long: cells a step further from the edge are taken."""
     edge = {row["cell"] for row in choose_cells_near_edges(list(rows()), KEYS, 4)}
     late = [
         lasting(row, lambda row: 160.0 if stable(row) and row["cell"] in edge else 20.0)
         for row in rows()
     ]
-    found = [row for row in choose_cells_near_edges(late, KEYS, 2) if stable(row)]
-    assert len(found) == 2
-    assert all(row["ran_s"] == 20.0 for row in found)
+    rows_taken = [row for row in choose_cells_near_edges(late, KEYS, 2) if stable(row)]
+    assert len(rows_taken) == 2
+    assert all(row["ran_s"] == 20.0 for row in rows_taken)
     with pytest.raises(UsageError, match="stable side of an edge ran longer than 60 s"):
         choose_cells_near_edges([lasting(row, lambda _: 160.0) for row in rows()], KEYS, 10)
 
 
-def test_none_is_no_number_of_cells() -> None:
+def test_zero_is_no_number_of_cells() -> None:
     with pytest.raises(UsageError, match="at least 1, not 0"):
         choose_cells_near_edges(list(rows()), KEYS, 0)
 
 
-def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> None:
-    found = [confirm_cell(cell(CALM), runner(tmp_path, instead=one)) for one in (CALM, WILD)]
-    grid = tabulate_confirmations(found, KEYS)
+def test_table_has_both_verdicts_and_the_log(tmp_path: Path) -> None:
+    confirmations = [
+        confirm_cell(cell(CALM), runner(tmp_path, instead=run)) for run in (CALM, WILD)
+    ]
+    grid = tabulate_confirmations(confirmations, KEYS)
     assert [row[grid.headers.index("virtual")] for row in grid.rows] == ["converged"] * 2
     assert [row[grid.headers.index("live")] for row in grid.rows] == ["converged", "diverged"]
     assert [row[-3] for row in grid.rows] == ["same", "DIFFERS"]
@@ -186,7 +197,7 @@ def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> N
 @pytest.mark.live
 @pytest.mark.long
 @pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
-def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(
+def test_zenoh_sessions_have_the_verdict_of_virtual_time(
     scenario: Scenario, tmp_path: Path
 ) -> None:
     from rich.console import Console
@@ -197,5 +208,5 @@ def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(
         outcome = run_demo(wanted, tmp_path, Console(quiet=True))
         return outcome.log, outcome.problems
 
-    found = confirm_cell(cell(scenario), run)
-    assert found.same, found.text
+    confirmation = confirm_cell(cell(scenario), run)
+    assert confirmation.same, confirmation.text

@@ -22,7 +22,7 @@ from trilat_net.errors import UsageError
 from trilat_net.presentation.appearance import make_print_size
 
 from .maps import KEYS, P_D, rows
-from .quick import asked
+from .quick import plan_quick_sweep
 
 DELAYS_MS = (200.0, 250.0)
 DAMPINGS = (0.8, 1.0, 1.2, 1.4)
@@ -50,7 +50,7 @@ def chart(results: SweepResults) -> StabilityMap:
     return build_stability_map(results, (), 1)
 
 
-def test_an_exponent_is_the_real_part_of_the_rightmost_root(results: SweepResults) -> None:
+def test_exponents_are_real_parts_of_rightmost_roots(results: SweepResults) -> None:
     """Within 2 % or 2e-3 /s, whichever is larger; some grow and some do not."""
     for delay_ms in DELAYS_MS:
         column = [row for row in results.rows if row[KEYS[0]] == delay_ms]
@@ -65,7 +65,7 @@ def test_an_exponent_is_the_real_part_of_the_rightmost_root(results: SweepResult
             assert row["exponent_per_s"] == pytest.approx(root, rel=0.02, abs=2e-3)
 
 
-def test_the_zero_line_is_the_edge_of_the_linear_analysis(chart: StabilityMap) -> None:
+def test_zero_line_is_the_linear_analysis_edge(chart: StabilityMap) -> None:
     """Within 2 %, from cells that are 0.2 apart."""
     zero, *_, linear = chart.lines[0]
     assert (zero.rank, linear.rank) == (-1, 1)
@@ -74,7 +74,7 @@ def test_the_zero_line_is_the_edge_of_the_linear_analysis(chart: StabilityMap) -
         assert zero.crossings(n, chart.plane.y) == [pytest.approx(edge, rel=0.02)]
 
 
-def test_page_sets_zero_of_column_beside_verdicts_and_theory(chart: StabilityMap) -> None:
+def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> None:
     table = tabulate_edges(chart.plane, chart.plane.panels[0], chart.lines[0])
     assert table.headers[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
     assert [row[0] for row in table.rows] == ["200", "250"]
@@ -87,10 +87,14 @@ def test_page_sets_zero_of_column_beside_verdicts_and_theory(chart: StabilityMap
 
 def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
-    made = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
-    plane = build_plane(made, KEYS, P_D)
+    shifted = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
+    plane = build_plane(shifted, KEYS, P_D)
     figure = draw_stability_map(plane, ((),), make_print_size(3.5))
-    mesh: Any = next(one for one in figure.axes[0].collections if isinstance(one, QuadMesh))
+    mesh: Any = next(
+        collection
+        for collection in figure.axes[0].collections
+        if isinstance(collection, QuadMesh)
+    )
     assert to_hex(mesh.to_rgba(0.0)) == "#ffffff"
     assert mesh.get_clim() == (-1.0, 1.0)
     assert figure.axes[-1].get_yticks().tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0]
@@ -99,30 +103,32 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
     assert red[0] > red[2]
 
 
-def test_place_has_mean_of_its_seeds_and_none_without_exponent() -> None:
-    made = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
-    made[0] |= {"exponent_per_s": None}
-    exponents = build_plane(made, KEYS, P_D).panels[0].exponents_per_s
+def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
+    seeded = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
+    seeded[0] |= {"exponent_per_s": None}
+    exponents = build_plane(seeded, KEYS, P_D).panels[0].exponents_per_s
     assert np.isnan(exponents[0, 0])
     assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
     assert not build_plane(list(rows()), KEYS, P_D).judged_by_twins
 
 
-def test_verdicts_and_exponents_are_not_mixed_in_a_folder(tmp_path: Path) -> None:
-    verdicts, twins = (asked(tmp_path, judge=judge) for judge in ("verdict", "twins"))
+def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
+    verdicts, twins = (
+        plan_quick_sweep(tmp_path, judge=judge) for judge in ("verdict", "twins")
+    )
     assert "judge" not in verdicts.facts()
     assert plan_from_json(verdicts.facts()).judge == "verdict"
     prepare_sweep_folder(verdicts, tmp_path / "o")
-    longest = asked(tmp_path, judge="twins", longest_s=verdicts.longest_s)
-    with pytest.raises(UsageError, match="another judge: there verdict, here twins"):
+    longest = plan_quick_sweep(tmp_path, judge="twins", longest_s=verdicts.longest_s)
+    with pytest.raises(UsageError, match="another judge: verdict in the folder, twins now"):
         prepare_sweep_folder(longest, tmp_path / "o")
     assert (twins.longest_s, verdicts.longest_s) == (0.5, 4.0)
     with pytest.raises(UsageError, match="verdict, twins, not 'luck'"):
-        asked(tmp_path, judge="luck")
+        plan_quick_sweep(tmp_path, judge="luck")
 
 
 def test_the_command_of_a_map_names_its_judge(tmp_path: Path) -> None:
-    assert build_sweep_command(asked(tmp_path, judge="twins"), "--map").endswith(
+    assert build_sweep_command(plan_quick_sweep(tmp_path, judge="twins"), "--map").endswith(
         " --judge twins --map"
     )
-    assert "--judge" not in build_sweep_command(asked(tmp_path))
+    assert "--judge" not in build_sweep_command(plan_quick_sweep(tmp_path))

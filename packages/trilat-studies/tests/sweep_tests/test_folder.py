@@ -1,4 +1,4 @@
-"""The folder of a sweep goes on with its own alone; of its journal a torn line costs no other."""
+"""The folder of a sweep resumes its own sweep only; a torn line of its journal costs no other line."""
 
 import json
 import math
@@ -22,35 +22,35 @@ from trilat_net.log.provenance import collect_provenance
 from trilat_net.work import study_folder as folders
 from trilat_net.work.study_folder import RunJournal
 
-from .quick import DAMPING, SHORT, asked, outcome_of
+from .quick import DAMPING, SHORT, outcome_of, plan_quick_sweep
 
 
 def refused(path: Path, *overrides: str, **settings: Any) -> str:
     with pytest.raises(UsageError) as error:
-        prepare_sweep_folder(asked(path.parent, *overrides, **settings), path)
+        prepare_sweep_folder(plan_quick_sweep(path.parent, *overrides, **settings), path)
     assert error.value.exit_code == 2
     return str(error.value)
 
 
 @pytest.fixture
-def begun(tmp_path: Path) -> Path:
-    """The folder of a sweep that was begun."""
-    return prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
+def sweep_folder(tmp_path: Path) -> Path:
+    """Returns the folder of a sweep that was begun."""
+    return prepare_sweep_folder(plan_quick_sweep(tmp_path), tmp_path / "o").path
 
 
-def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
-    plan = (begun / PLAN_FILE).read_bytes()
-    again = prepare_sweep_folder(asked(begun.parent), begun)
-    assert open_sweep_folder(begun).facts == again.facts == json.loads(plan)
-    assert (begun / PLAN_FILE).read_bytes() == plan
-    assert [path.name for path in begun.iterdir()] == [PLAN_FILE]
+def test_the_same_sweep_resumes_in_its_folder(sweep_folder: Path) -> None:
+    plan = (sweep_folder / PLAN_FILE).read_bytes()
+    again = prepare_sweep_folder(plan_quick_sweep(sweep_folder.parent), sweep_folder)
+    assert open_sweep_folder(sweep_folder).facts == again.facts == json.loads(plan)
+    assert (sweep_folder / PLAN_FILE).read_bytes() == plan
+    assert [path.name for path in sweep_folder.iterdir()] == [PLAN_FILE]
 
 
 @pytest.mark.parametrize(
-    ("overrides", "settings", "words"),
+    ("overrides", "settings", "phrases"),
     [
         (["control.Kp=2"], {}, ("another scenario", "trio (sha256 ")),
-        (["control.Kd=3"], {}, ("other settings", "there none, here control.Kd=3")),
+        (["control.Kd=3"], {}, ("other settings", "none in the folder, control.Kd=3 now")),
         (
             [],
             {"over": [DAMPING]},
@@ -62,35 +62,43 @@ def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
         ([], {"longest_s": 2.0}, ("another longest time", "4 s in the folder, 2 s now")),
     ],
 )
-def test_another_sweep_is_refused_with_what_differs(
-    begun: Path, overrides: list[str], settings: dict[str, Any], words: tuple[str, ...]
+def test_another_sweep_is_refused_with_its_differences(
+    sweep_folder: Path,
+    overrides: list[str],
+    settings: dict[str, Any],
+    phrases: tuple[str, ...],
 ) -> None:
-    problem = refused(begun, *overrides, **settings)
-    for word in (str(begun), "results cannot be mixed", "choose another folder", *words):
+    problem = refused(sweep_folder, *overrides, **settings)
+    for word in (
+        str(sweep_folder),
+        "results cannot be mixed",
+        "choose another folder",
+        *phrases,
+    ):
         assert word in problem
 
 
-def test_a_scenario_that_was_edited_since_is_refused(begun: Path) -> None:
-    (begun.parent / "trio.toml").write_text(
+def test_an_edited_scenario_is_refused(sweep_folder: Path) -> None:
+    (sweep_folder.parent / "trio.toml").write_text(
         SHORT.replace("delay_ms = 50.0", "delay_ms = 50.0 # ms")
     )
-    assert "another text of the scenario" in refused(begun)
+    assert "another text of the scenario" in refused(sweep_folder)
 
 
 def test_another_arithmetic_or_program_is_refused(
-    begun: Path, monkeypatch: pytest.MonkeyPatch
+    sweep_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
-        words = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
-        assert words in refused(begun)
+        reason = f"another kind of arithmetic: {compute_fingerprint()} in the folder, 0000"
+        assert reason in refused(sweep_folder)
     older = {**collect_provenance(), "version_numba": "0.1"}
     monkeypatch.setattr(folders, "collect_provenance", lambda: older)
     with pytest.raises(UsageError, match=r"another version of the program: .*numba 0\.1"):
-        open_sweep_folder(begun)
+        open_sweep_folder(sweep_folder)
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_contents_is_left_alone(tmp_path: Path) -> None:
     other = tmp_path / "o"
     other.mkdir()
     (other / "precious").write_text("precious")
@@ -99,7 +107,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "phrase"),
     [
         (None, "this folder contains no sweep"),
         ("{", "is not JSON"),
@@ -108,11 +116,11 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
     ],
 )
 def test_a_folder_without_a_plan_is_refused(
-    tmp_path: Path, content: str | None, words: str
+    tmp_path: Path, content: str | None, phrase: str
 ) -> None:
     if content is not None:
         (tmp_path / PLAN_FILE).write_text(content)
-    with pytest.raises(UsageError, match=words):
+    with pytest.raises(UsageError, match=phrase):
         open_sweep_folder(tmp_path)
 
 
@@ -137,7 +145,7 @@ def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
     )
 
 
-def written(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:
+def write_journal(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:
     with opened(path, sweep) as journal:
         for one in entries:
             journal.add(one)
@@ -154,7 +162,7 @@ FIVE = [entry(cell) for cell in range(5)]
 
 @pytest.fixture(scope="module")
 def five(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return written(tmp_path_factory.mktemp("journal") / "j", FIVE)
+    return write_journal(tmp_path_factory.mktemp("journal") / "j", FIVE)
 
 
 @pytest.fixture
@@ -162,18 +170,18 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "j"
 
 
-def test_what_is_written_is_read_number_for_number(path: Path) -> None:
+def test_written_numbers_are_read_back_exactly(path: Path) -> None:
     odd = msgspec.structs.replace(
         FIVE[0],
         cell=9,
         outcome=msgspec.structs.replace(FIVE[0].outcome, peak_error_rad=math.inf),
     )
-    written(path, [*FIVE, odd])
+    write_journal(path, [*FIVE, odd])
     assert read(path) == [*FIVE, odd]
 
 
 @given(data=st.data())
-def test_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
+def test_a_cut_file_keeps_whole_lines_and_grows(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     cut = data.draw(st.integers(0, len(five)))
@@ -183,12 +191,12 @@ def test_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
     kept = read(path)
     assert kept[:whole] == FIVE[:whole]
     assert len(kept) <= whole + 1  # a line that lacks its line feed alone is whole
-    written(path, FIVE)
+    write_journal(path, FIVE)
     assert sorted(read(path), key=lambda one: one.cell) == FIVE
 
 
 @given(data=st.data())
-def test_a_byte_that_is_wrong_loses_its_line_alone(
+def test_a_wrong_byte_loses_only_its_line(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     at = data.draw(st.integers(0, len(five) - 1))
@@ -198,22 +206,22 @@ def test_a_byte_that_is_wrong_loses_its_line_alone(
     kept = read(path)
     line = five[:at].count(b"\n")
     lost = {line, line + 1} if five[at : at + 1] == b"\n" else {line}
-    assert [one for one in FIVE if one.cell not in lost] == [
-        one for one in kept if one.cell not in lost
+    assert [kept_entry for kept_entry in FIVE if kept_entry.cell not in lost] == [
+        kept_entry for kept_entry in kept if kept_entry.cell not in lost
     ]
-    assert all(one in FIVE for one in kept)
+    assert all(kept_entry in FIVE for kept_entry in kept)
 
 
-def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
-    written(path, FIVE, "another sweep")
+def test_lines_of_another_sweep_are_ignored(path: Path) -> None:
+    write_journal(path, FIVE, "another sweep")
     assert read(path) == []
-    written(path, FIVE[:2])
+    write_journal(path, FIVE[:2])
     assert read(path) == FIVE[:2]
     assert read(path, "another sweep") == FIVE
 
 
-def test_a_run_refused_by_a_full_disk_is_not_done(path: Path) -> None:
-    """`/dev/full` answers as a disk does that is full."""
+def test_a_run_refused_by_full_disk_is_pending(path: Path) -> None:
+    """`/dev/full` answers like a full disk."""
     with opened(path, "sweep") as journal:
         journal.add(FIVE[0])
         whole = journal._file
@@ -221,8 +229,8 @@ def test_a_run_refused_by_a_full_disk_is_not_done(path: Path) -> None:
             journal._file = full
             with pytest.raises(
                 LogRefused, match=r"No space left on device.*make room, and continue with"
-            ) as found:
+            ) as error:
                 journal.add(FIVE[1])
         journal._file = whole
         assert [entry.cell for entry in journal.done.values()] == [FIVE[0].cell]
-    assert found.value.exit_code == 5
+    assert error.value.exit_code == 5

@@ -1,4 +1,4 @@
-"""A cell's word is the certificate's on a log of the same run, and extending is running longer."""
+"""A cell's verdict is the certificate's on a log of the same run, and extending equals running longer."""
 
 import io
 import math
@@ -36,30 +36,30 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def judged(scenario: Scenario, longest_s: float = 0.0) -> CellResult:
+def judge_result(scenario: Scenario, longest_s: float = 0.0) -> CellResult:
     return classify_cell(scenario.text, longest_s)
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
+def test_verdict_and_numbers_are_those_of_a_log(run: str) -> None:
     name, changes = RUNS[run]
     scenario = load_scenario(name, changes)
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream)
     stream.seek(0)
     log = open_log(stream)
-    found, certificate = judged(scenario), certify_run(log)
+    result, certificate = judge_result(scenario), certify_run(log)
     expected = certificate.end
-    assert found.motion is expected.behaviour
-    assert found.verdict is classify_decision(certificate.stability, expected.behaviour)
-    assert found.stability == certificate.stability
-    assert (found.end_error_rad, found.end_speed_rad_s) == (
+    assert result.motion is expected.behaviour
+    assert result.verdict is classify_decision(certificate.stability, expected.behaviour)
+    assert result.stability == certificate.stability
+    assert (result.end_error_rad, result.end_speed_rad_s) == (
         expected.end_error_rad,
         expected.end_speed_rad_s,
     )
     rate = expected.error.rate_per_s
-    assert found.error_rate_per_s == (None if math.isnan(rate) else rate)
-    assert found.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
+    assert result.error_rate_per_s == (None if math.isnan(rate) else rate)
+    assert result.peak_error_rad == max(float(abs(log[site].e).max()) for site in log.sites)
 
 
 @pytest.mark.parametrize(
@@ -72,93 +72,101 @@ def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
         ("contact", {"duration_s": 60.0, "sites.m.control.k_f": 0.2}, CellClass.CONVERGED),
     ],
 )
-def test_what_the_scenarios_are_known_to_do(
+def test_scenarios_have_their_published_behaviour(
     name: str, changes: dict[str, Any], verdict: CellClass
 ) -> None:
     """The figures of these scenarios, from an independent implementation, stand in their texts."""
-    assert judged(load_scenario(name, changes)).verdict is verdict
+    assert judge_result(load_scenario(name, changes)).verdict is verdict
 
 
 @pytest.mark.long
-def test_law_in_python_is_judged_as_same_law_of_kernel() -> None:
-    """`tests.laws:Adaptive` is Eq. (13) and (15) by other code, with the gains of the scenario."""
+def test_python_law_is_judged_like_kernel_law() -> None:
+    """`tests.laws:Adaptive` is Eq.
+
+    (13) and (15) by other code, with the gains of the scenario.
+    """
     short = {"duration_s": 2.0, "link.delay_ms": 5.0}
     theirs = load_scenario("free", {**short, "control.law": "tests.laws:Adaptive"})
-    assert judged(theirs) == judged(load_scenario("free", short))
+    assert judge_result(theirs) == judge_result(load_scenario("free", short))
 
 
 @pytest.mark.long
-def test_what_is_not_plain_goes_on_and_is_longer_run() -> None:
-    """Of a growth of 0.01/s nothing is to be seen in 4 s."""
+def test_an_undecided_run_continues_as_longer_run() -> None:
+    """A growth of 0.01/s is invisible in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}
     scenario = load_scenario("p_d_margin", changes)
-    assert not is_conclusive(judged(scenario))
-    found = judged(scenario, longest_s=256.0)
-    assert found.verdict is CellClass.DIVERGED
-    assert found.extended > 0
-    assert found.ran_s == 4.0 * 2**found.extended
-    whole = judged(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
+    assert not is_conclusive(judge_result(scenario))
+    result = judge_result(scenario, longest_s=256.0)
+    assert result.verdict is CellClass.DIVERGED
+    assert result.extended > 0
+    assert result.ran_s == 4.0 * 2**result.extended
+    whole = judge_result(load_scenario("p_d_margin", {**changes, "duration_s": result.ran_s}))
     totals = FusedRun(scenario)  # those of the scenario's own duration
     totals.advance_to(4.0)
     assert (
-        msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict())
-        == found
+        msgspec.structs.replace(whole, extended=result.extended, **totals.totals._asdict())
+        == result
     )
 
 
-def test_slow_trend_of_run_with_chance_in_it_decides_nothing() -> None:
+def test_slow_trends_under_random_links_decide_nothing() -> None:
     """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
-    found = judged(
+    result = judge_result(
         load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}),
         longest_s=160.0,
     )
-    assert found.verdict is not CellClass.CONVERGED
-    assert found.end_speed_rad_s > 5.0
+    assert result.verdict is not CellClass.CONVERGED
+    assert result.end_speed_rad_s > 5.0
 
 
-def test_it_is_never_extended_beyond_what_was_asked() -> None:
+def test_no_run_is_extended_beyond_its_limit() -> None:
     scenario = load_scenario("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
-    found = judged(scenario, longest_s=10.0)
-    assert (found.ran_s, found.extended) == (10.0, 2)
-    assert not is_conclusive(found)
+    result = judge_result(scenario, longest_s=10.0)
+    assert (result.ran_s, result.extended) == (10.0, 2)
+    assert not is_conclusive(result)
 
 
 @pytest.mark.parametrize("d", [0.95, 1.05])
-def test_few_per_cent_beside_edge_word_is_right(d: float) -> None:
-    """The edge is d = (K / 2) sin(w T) / w with w at the edge, 0.97 here: what 20 s cannot tell, 160 s do."""
+def test_few_per_cent_beside_edge_verdicts_are_right(d: float) -> None:
+    """The edge is d = (K / 2) sin(w T) / w with w at the edge, 0.97 here.
+
+    Runs of 160 s decide where runs of 20 s cannot.
+    """
     scenario = load_scenario("p_d_margin", {"control.d": d, "duration_s": 20.0})
-    found = judged(scenario, longest_s=160.0)
-    assert found.extended > 0
-    assert found.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
+    result = judge_result(scenario, longest_s=160.0)
+    assert result.extended > 0
+    assert result.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
 
 
 @pytest.mark.parametrize(
     ("d", "verdict"), [(0.93, CellClass.BOUNDED), (1.0, CellClass.CONVERGED)]
 )
-def test_roots_decide_about_arms_that_hardly_move(d: float, verdict: CellClass) -> None:
-    """Arms 1e-3 rad apart: by their speed they rest, and the rightmost root is +0.002 /s or -0.02 /s."""
+def test_roots_decide_for_arms_that_hardly_move(d: float, verdict: CellClass) -> None:
+    """Arms 1e-3 rad apart count as resting by their speed; the rightmost root is +0.002 /s or -0.02 /s."""
     starts = {
         f"sites.{name}.q0_rad": [-0.6, 1.8 + off]
         for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
     }
-    found = judged(
+    result = judge_result(
         load_scenario(
             "p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}
         )
     )
-    assert found.verdict is verdict
+    assert result.verdict is verdict
 
 
-def test_a_run_that_diverges_says_when() -> None:
-    found = judged(load_scenario(*RUNS["diverged"]), longest_s=100.0)
-    assert found.motion is EndBehaviour.DIVERGED
-    assert found.diverged_s == found.ran_s
-    assert found.extended == 0
-    assert found.end_speed_rad_s > 5.0
+def test_a_diverging_run_has_its_instant() -> None:
+    result = judge_result(load_scenario(*RUNS["diverged"]), longest_s=100.0)
+    assert result.motion is EndBehaviour.DIVERGED
+    assert result.diverged_s == result.ran_s
+    assert result.extended == 0
+    assert result.end_speed_rad_s > 5.0
 
 
-def test_a_trial_sees_no_roots_but_a_cell_and_a_certificate_do() -> None:
-    """Arms that start at one pose stay there, however unstable it is (docs/reference/stability.md)."""
+def test_trials_see_no_roots_but_certificates_do() -> None:
+    """Arms that start at one pose stay there, however unstable that pose is
+    (docs/reference/stability.md).
+    """
     together = {f"sites.{name}.q0_rad": [0.2, 0.3] for name in ("m1", "m2", "s")}
     scenario = load_scenario(
         "p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0}
@@ -167,7 +175,7 @@ def test_a_trial_sees_no_roots_but_a_cell_and_a_certificate_do() -> None:
     assert cell.verdict is CellClass.BOUNDED
     assert "this rest: unstable" in cell.reasons
     assert measure_virtual_run(scenario).end.stability is Stability.SETTLED
-    found = certify_run(trilat_net.simulate(scenario))
-    assert found.end.stability is Stability.SETTLED
-    assert found.stability is Stability.NOT_STABLE
-    assert found.decision.rests_on.startswith("exact roots, fastest growing +")
+    certificate = certify_run(trilat_net.simulate(scenario))
+    assert certificate.end.stability is Stability.SETTLED
+    assert certificate.stability is Stability.NOT_STABLE
+    assert certificate.decision.rests_on.startswith("exact roots, fastest growing +")

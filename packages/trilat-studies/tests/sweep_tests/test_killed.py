@@ -1,4 +1,4 @@
-"""A sweep that is killed and interrupted comes to the same end, and makes no run twice."""
+"""A sweep that is killed and interrupted has the same results, and makes no run twice."""
 
 import os
 import re
@@ -32,13 +32,14 @@ LONGER = SHORT.replace("rate_hz = 100", "rate_hz = 500").replace(
 
 
 def lines(results: Path) -> int:
-    """How many runs the journal has."""
+    """Returns the number of runs in the journal."""
     journal = results / JOURNAL_FILE
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
 def stopped(folder: Path, number: int, count: int, *arguments: str) -> tuple[int, str]:
-    """Runs `trilat sweep` until its journal has so many runs; returns how a signal ended it.
+    """Runs `trilat sweep` until its journal has `count` runs, and returns the exit code after
+    the signal.
 
     SIGKILL goes to all of its processes, as when a machine is switched off.
     """
@@ -58,19 +59,19 @@ def stopped(folder: Path, number: int, count: int, *arguments: str) -> tuple[int
 
 
 def keys(journal: Path) -> list[tuple[int, int]]:
-    """The runs whose lines are whole, as often as they stand there."""
+    """Returns the keys of all whole lines, with repetitions."""
     whole = [
         line
         for line in journal.read_bytes().splitlines()
         if re.fullmatch(rb"{.*}\t[0-9a-f]{8}", line)
     ]
-    found = [msgspec.json.decode(line.partition(b"\t")[0]) for line in whole]
-    return [(one["cell"], one["seed"]) for one in found]
+    entries = [msgspec.json.decode(line.partition(b"\t")[0]) for line in whole]
+    return [(entry["cell"], entry["seed"]) for entry in entries]
 
 
 @pytest.mark.long
-def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Path) -> None:
-    """SIGKILL to all its processes, then Ctrl-C; two processes, where the whole sweep had one."""
+def test_killed_and_interrupted_sweeps_resume_to_equal_bytes(tmp_path: Path) -> None:
+    """SIGKILL to all processes, then Ctrl-C; the resumed sweep has two processes, the whole sweep one."""
     (tmp_path / "trio.toml").write_text(LONGER)
     sweep = ("trio.toml", *OPTIONS, "-o")
     trilat("sweep", *sweep, "whole", "--jobs", "1", cwd=tmp_path).succeeds()
@@ -90,5 +91,5 @@ def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Pat
     text = trilat("sweep", *sweep, "parts", "--jobs", "2", cwd=tmp_path).succeeds()
     assert f"{kept} runs are done already" in text
     assert (parts / "results.csv").read_bytes() == (tmp_path / "whole/results.csv").read_bytes()
-    made = keys(parts / JOURNAL_FILE)
-    assert len(made) == len(set(made)) == RUNS
+    run_keys = keys(parts / JOURNAL_FILE)
+    assert len(run_keys) == len(set(run_keys)) == RUNS

@@ -1,4 +1,4 @@
-"""A sweep whose cells run side by side has the table of one whose cells run one by one."""
+"""A sweep whose cells run side by side has the table of a sweep whose cells run one by one."""
 
 from pathlib import Path
 

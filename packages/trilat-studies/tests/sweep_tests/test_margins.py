@@ -1,4 +1,4 @@
-"""Margins: an edge encloses what is there; over a plane beside theory, as table, page and JSON."""
+"""Margins: an interval encloses each edge; over a plane beside theory, as table, page and JSON."""
 
 import json
 import math
@@ -30,14 +30,14 @@ from trilat_net.scenario import parse_scenario
 WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
 
 
-def asked(*over: str, **settings: object) -> SweepPlan:
+def plan_margin_sweep(*over: str, **settings: object) -> SweepPlan:
     axes = over or ("link.delay_ms=100,200",)
     return plan_sweep("p_d_margin", over=[*axes, format_range_axis(WITHIN)], **settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture
 def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A judge that goes by the condition of P+d, and remembers nothing."""
+    """Stands for the judge: follows the condition of P+d and remembers nothing."""
 
     def judge(text: str, _: float) -> CellResult:
         scenario = parse_scenario(text)
@@ -52,25 +52,25 @@ def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No linear analysis, which takes seconds."""
+    """Leaves out the linear analysis, which takes seconds."""
     monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_, **__: ((), ""))
 
 
 @pytest.mark.usefixtures("by_the_line")
 def test_a_place_has_its_edge_beside_theory() -> None:
-    (one,) = search_margins(asked("link.delay_ms=200"), WITHIN, 1)
-    assert one.cell.values == (200.0,)
-    (span,) = one.margin.spans
+    (point,) = search_margins(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1)
+    assert point.cell.values == (200.0,)
+    (span,) = point.margin.spans
     assert span.low <= 1.0 <= span.high
-    assert one.closed == pytest.approx(1.0)
-    assert one.linear == (pytest.approx(1.0, rel=0.04),)
-    assert one.remark == ""
+    assert point.closed == pytest.approx(1.0)
+    assert point.linear == (pytest.approx(1.0, rel=0.04),)
+    assert point.remark == ""
 
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
-def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
-    lossy = search_margins(asked("link.loss=0,0.1", seeds=2), WITHIN, 1)
-    assert [(one.cell.values, one.seed) for one in lossy] == [
+def test_seeds_are_places_where_links_are_random() -> None:
+    lossy = search_margins(plan_margin_sweep("link.loss=0,0.1", seeds=2), WITHIN, 1)
+    assert [(point.cell.values, point.seed) for point in lossy] == [
         ((0.0,), 1),
         ((0.1,), 1),
         ((0.1,), 2),
@@ -79,37 +79,42 @@ def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
 
 @pytest.mark.long
 def test_the_number_of_processes_changes_nothing() -> None:
-    """Runs of p_d at 100 Hz, 1 s: what they show is another question."""
+    """Runs of p_d at 100 Hz for 1 s; their verdicts do not matter."""
     brief = ["duration_s=1.0", "rate_hz=100"]
     within = WITHIN._replace(tolerance=0.2)
-    wanted = plan_sweep(
+    plan = plan_sweep(
         "p_d_margin",
         brief,
         over=["link.delay_ms=100,400", format_range_axis(within)],
         longest_s=1.0,
     )
-    assert search_margins(wanted, within, 1) == search_margins(wanted, within, 2)
+    assert search_margins(plan, within, 1) == search_margins(plan, within, 2)
 
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
-def test_a_key_of_whole_numbers_is_searched_in_them() -> None:
-    """The judge calls 300 Hz and 50 Hz alike: what counts is that no value between whole numbers is run."""
+def test_whole_number_keys_are_searched_in_integers() -> None:
+    """The judge gives 300 Hz and 50 Hz the same verdict; no value between whole numbers may be run."""
     within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
-    wanted = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
-    assert [one.margin.stable for one in search_margins(wanted, within, 1)] == [True, True]
+    plan = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
+    assert [margin.margin.stable for margin in search_margins(plan, within, 1)] == [True, True]
 
 
-def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
-    cell = asked().cell(0)
+def make_point_margin(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
+    cell = plan_margin_sweep().cell(0)
     return GridPointMargin(
         cell._replace(values=(100.0,)), 1, KeyMargin(spans, stable, 0, 12), (0.5, 2.0), "", 0.51
     )
 
 
-def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
+def test_table_shows_edges_islands_and_missing_edges() -> None:
     edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
-    every = [found(*edges), found(stable=True), found(stable=False), found()]
-    grid = SweepMargins(asked(), WITHIN, every).table()
+    points = [
+        make_point_margin(*edges),
+        make_point_margin(stable=True),
+        make_point_margin(stable=False),
+        make_point_margin(),
+    ]
+    grid = SweepMargins(plan_margin_sweep(), WITHIN, points).table()
     edge = grid.headers.index("edge of d (N m s/rad)")
     assert [row[edge] for row in grid.rows] == [
         "0.49 to 0.492",
@@ -123,21 +128,26 @@ def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
     assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
     assert (
-        "not monotone at 1 of 2 grid points" in SweepMargins(asked(), WITHIN, every[:2]).page()
+        "not monotone at 1 of 2 grid points"
+        in SweepMargins(plan_margin_sweep(), WITHIN, points[:2]).page()
     )
 
 
 def test_the_facts_are_json_and_name_the_command() -> None:
-    margins = SweepMargins(asked(), WITHIN, [found(StabilityEdge(0.49, 0.492, False, True))])
-    told = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
-    assert told["command"] == margins.command
-    assert told["command"].endswith(
+    margins = SweepMargins(
+        plan_margin_sweep(),
+        WITHIN,
+        [make_point_margin(StabilityEdge(0.49, 0.492, False, True))],
+    )
+    facts = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
+    assert facts["command"] == margins.command
+    assert facts["command"].endswith(
         "--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005"
     )
-    (place,) = told["places"]
-    assert place.pop("link.delay_ms") == 100.0
-    assert is_documented("sweep --margin", told)
-    assert place["edges"] == [
+    (point,) = facts["places"]
+    assert point.pop("link.delay_ms") == 100.0
+    assert is_documented("sweep --margin", facts)
+    assert point["edges"] == [
         {"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}
     ]
 
@@ -145,12 +155,12 @@ def test_the_facts_are_json_and_name_the_command() -> None:
 @pytest.mark.parametrize(
     "text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
 )
-def test_what_is_no_range_is_refused(text: str) -> None:
+def test_an_invalid_range_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"along must have the form KEY=FROM:TO"):
         parse_search_range(text)
 
 
-def test_a_range_is_read_as_it_is_written() -> None:
+def test_a_range_is_read_as_written() -> None:
     assert parse_search_range("control.d=0.2:3") == WITHIN
     assert format_range_axis(WITHIN) == "control.d=0.2,3"
     with pytest.raises(UsageError, match="fraction of the value at the edge"):
@@ -161,56 +171,56 @@ def test_a_range_is_read_as_it_is_written() -> None:
 def test_an_edge_is_enclosed_to_the_tolerance(
     edge: float, above: bool, tolerance: float
 ) -> None:
-    asked = []
+    values = []
 
     def stable(value: float) -> bool:
-        asked.append(value)
+        values.append(value)
         return (value > edge) is above
 
-    found = search_key_margin(stable, 0.2, 3.0, tolerance)
-    (span,) = found.spans
+    margin = search_key_margin(stable, 0.2, 3.0, tolerance)
+    (span,) = margin.spans
     assert span.low <= edge <= span.high
     assert span.high - span.low <= tolerance * span.high
     assert span.stable_below is not above
     assert span.sharp
-    assert found.runs == len(asked) == len(set(asked))
-    assert found.runs <= SCAN_POINTS + 1 + math.log2(
+    assert margin.runs == len(values) == len(set(values))
+    assert margin.runs <= SCAN_POINTS + 1 + math.log2(
         2.8 / (SCAN_POINTS - 1) / (0.2 * tolerance)
     )
 
 
 @given(st.floats(0.35, 2.8), st.floats(0.001, 0.1), st.booleans())
-def test_what_stays_undecided_is_the_interval_that_is_given(
+def test_an_undecided_part_is_the_reported_interval(
     edge: float, width: float, above: bool
 ) -> None:
     def stable(value: float) -> bool | None:
         return None if abs(value - edge) < width else (value > edge) is above
 
-    found = search_key_margin(stable, 0.2, 3.0, 0.01)
-    (span,) = found.spans
+    margin = search_key_margin(stable, 0.2, 3.0, 0.01)
+    (span,) = margin.spans
     assert span.low <= edge - width + 1e-9
     assert edge + width - 1e-9 <= span.high
     if span.sharp:
         assert span.high - span.low <= 0.01 * span.high
     else:
-        assert found.undecided > 0
+        assert margin.undecided > 0
         assert (edge - width) - span.low <= 0.01 * span.high
         assert span.high - (edge + width) <= 0.01 * span.high
 
 
 @pytest.mark.parametrize("side", [True, False, None])
-def test_without_change_there_is_no_edge_and_side_is_told(side: bool | None) -> None:
-    found = search_key_margin(lambda _: side, 0.2, 3.0)
-    assert (found.spans, found.stable, found.runs) == ((), side, SCAN_POINTS)
+def test_without_change_only_the_side_is_reported(side: bool | None) -> None:
+    margin = search_key_margin(lambda _: side, 0.2, 3.0)
+    assert (margin.spans, margin.stable, margin.runs) == ((), side, SCAN_POINTS)
 
 
-def test_an_island_has_both_its_shores() -> None:
-    found = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
-    first, second = found.spans
+def test_an_island_has_two_edges() -> None:
+    margin = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
+    first, second = margin.spans
     assert first.low <= 1.0 <= first.high
     assert second.low <= 1.9 <= second.high
     assert (first.stable_below, second.stable_below) == (True, False)
-    assert found.stable is None
+    assert margin.stable is None
 
 
 @given(st.floats(20.2, 299.8))
@@ -225,7 +235,7 @@ def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
     )
 
 
-def test_an_edge_near_nothing_ends_all_the_same() -> None:
+def test_searching_an_edge_near_zero_ends() -> None:
     """A tolerance relative to 0 is never met."""
     (span,) = search_key_margin(lambda value: value > 1e-300, 0.0, 1.0).spans
     assert span.low <= 1e-300 <= span.high

@@ -1,4 +1,6 @@
-"""Metrics of a sweep: asked for by the keys of docs/reference/metrics.md, they are those of a log of the same run."""
+"""Metrics of a sweep, requested by the keys of docs/reference/metrics.md, equal those of a log
+of the same run.
+"""
 
 from pathlib import Path
 
@@ -14,26 +16,28 @@ KEYS = ["settle_s", "spread_rms_rad", "peak_tau_nm"]
 AXIS = {"link.delay_ms": [20, 200]}
 
 
-def swept(folder: Path, **more: object) -> SweepResults:
+def run_metric_sweep(folder: Path, **more: object) -> SweepResults:
     return trilat_net.sweep(
         "two_sites", AXIS, ["duration_s=0.5"], metrics=KEYS, out=folder, jobs=1, **more
     )
 
 
-def of_run(log: Log, key: str) -> float | None:
-    """What `compare` shows of a log."""
+def find_log_metric(log: Log, key: str) -> float | None:
+    """Returns the metrics that `compare` shows of a log."""
     return trilat_net.compare(log, log).metrics.row(key).values[0]
 
 
-def test_metrics_of_a_cell_are_those_of_its_log(tmp_path: Path) -> None:
-    found = swept(tmp_path / "o", duration_s=0.5, longest_s=0.5)
-    for row in found.rows:
+def test_metrics_of_a_cell_equal_its_logs(tmp_path: Path) -> None:
+    results = run_metric_sweep(tmp_path / "o", duration_s=0.5, longest_s=0.5)
+    for row in results.rows:
         delay = row["link.delay_ms"]
         log = trilat_net.simulate("two_sites", {"duration_s": 0.5, "link.delay_ms": delay})
-        assert {key: row[key] for key in KEYS} == {key: of_run(log, key) for key in KEYS}
+        assert {key: row[key] for key in KEYS} == {
+            key: find_log_metric(log, key) for key in KEYS
+        }
 
 
-def test_numbers_of_every_row_are_metrics_of_their_keys(tmp_path: Path) -> None:
+def test_every_row_holds_metrics_under_their_keys(tmp_path: Path) -> None:
     (row,) = trilat_net.sweep(
         "contact",
         ["link.delay_ms=20"],
@@ -44,15 +48,17 @@ def test_numbers_of_every_row_are_metrics_of_their_keys(tmp_path: Path) -> None:
     ).rows
     log = trilat_net.simulate("contact", {"duration_s": 12, "link.delay_ms": 20})
     for key in ("rms_error_rad", "walls_j", "force_peak_n"):
-        assert row[key] == pytest.approx(of_run(log, key), rel=1e-9)
+        assert row[key] == pytest.approx(find_log_metric(log, key), rel=1e-9)
     assert row["force_peak_n"] > 0.1
 
 
-def test_metrics_are_kept_with_results_of_a_resumed_sweep(tmp_path: Path) -> None:
-    found = swept(tmp_path / "o")
-    assert read_results(tmp_path / "o").to_rows() == found.to_rows()
-    assert swept(tmp_path / "o").to_rows() == found.to_rows()
-    with pytest.raises(UsageError, match=r"other metrics: there settle_s, .*, here none"):
+def test_a_resumed_sweep_keeps_its_metrics(tmp_path: Path) -> None:
+    results = run_metric_sweep(tmp_path / "o")
+    assert read_results(tmp_path / "o").to_rows() == results.to_rows()
+    assert run_metric_sweep(tmp_path / "o").to_rows() == results.to_rows()
+    with pytest.raises(
+        UsageError, match=r"other metrics: settle_s, .* in the folder, none now"
+    ):
         trilat_net.sweep("two_sites", AXIS, ["duration_s=0.5"], out=tmp_path / "o", jobs=1)
 
 
@@ -73,7 +79,7 @@ def test_seeds_give_a_metric_its_mean_and_interval(tmp_path: Path) -> None:
     assert places["spread_rms_rad_half"][1] > 0.0
 
 
-def test_a_metric_that_is_none_is_refused_with_the_nearest(tmp_path: Path) -> None:
+def test_unknown_metrics_are_refused_with_the_nearest(tmp_path: Path) -> None:
     done = trilat(
         "sweep",
         "two_sites",

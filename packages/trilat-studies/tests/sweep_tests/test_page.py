@@ -1,4 +1,4 @@
-"""The page of a map, and its figure: colours are the verdicts, borders half way, lines on top."""
+"""The page of a map, and its figure: colours are the verdicts, borders lie half way, lines on top."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from trilat_studies.sweep.sweep_plan import plan_sweep
 
 from trilat_net.presentation.appearance import make_print_size
 
-from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
+from .maps import DAMPINGS, DELAYS_MS, judge_by_condition, make_plane, rows
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
 EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
@@ -36,15 +36,13 @@ HALF = MapLine(
 
 @pytest.fixture
 def chart() -> StabilityMap:
-    plane = drawn(link__playout_ms=(0.0, 400.0))
+    plane = make_plane(link__playout_ms=(0.0, 400.0))
     return StabilityMap(
         plane, ((EXACT, HALF), (EXACT,)), ("a remark",), ("trilat sweep a", "trilat map"), "P+d"
     )
 
 
-def test_the_folder_has_a_picture_a_vector_and_a_page(
-    chart: StabilityMap, tmp_path: Path
-) -> None:
+def test_folder_has_a_picture_vector_and_page(chart: StabilityMap, tmp_path: Path) -> None:
     paths = write_map(chart, tmp_path)
     assert [path.name for path in paths] == ["map.png", "map.svg", "map.pdf", "map.md"]
     # 3.5 in, 300 pixels to the inch
@@ -53,14 +51,14 @@ def test_the_folder_has_a_picture_a_vector_and_a_page(
 
 
 @pytest.mark.long
-def test_the_same_results_give_the_same_bytes(chart: StabilityMap, tmp_path: Path) -> None:
+def test_equal_results_give_equal_bytes(chart: StabilityMap, tmp_path: Path) -> None:
     again = tmp_path / "again"
     again.mkdir()
     for one, other in zip(write_map(chart, tmp_path), write_map(chart, again), strict=True):
         assert one.read_bytes() == other.read_bytes()
 
 
-def test_the_page_tells_commands_lines_and_remarks(chart: StabilityMap) -> None:
+def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
     text = build_map_page(chart, "map.png")
     assert text.startswith("# P+d\n")
     assert "trilat sweep a\ntrilat map\n```" in text
@@ -71,12 +69,12 @@ def test_the_page_tells_commands_lines_and_remarks(chart: StabilityMap) -> None:
 
 
 def test_counts_are_of_all_runs() -> None:
-    plane = drawn(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
+    plane = make_plane(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
     assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
 
 
-def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
-    plane = drawn()
+def test_an_edge_stands_beside_each_lines_difference() -> None:
+    plane = make_plane()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
     heads = [
         "delay (ms)",
@@ -98,8 +96,8 @@ def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
         assert row[6] == expected
 
 
-def test_a_line_that_is_not_there_has_no_difference() -> None:
-    plane = drawn()
+def test_a_missing_line_has_no_difference() -> None:
+    plane = make_plane()
     table = tabulate_edges(
         plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
     )
@@ -107,7 +105,7 @@ def test_a_line_that_is_not_there_has_no_difference() -> None:
 
 
 def test_a_map_without_an_edge_has_no_table() -> None:
-    plane = drawn(lambda *_, **__: CellClass.CONVERGED)
+    plane = make_plane(lambda *_, **__: CellClass.CONVERGED)
     assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
 
 
@@ -119,17 +117,22 @@ def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = 
 
 
 def meshes(made: Figure) -> list[QuadMesh]:
-    return [one for axes in made.axes for one in axes.collections if isinstance(one, QuadMesh)]
+    return [
+        collection
+        for axes in made.axes
+        for collection in axes.collections
+        if isinstance(collection, QuadMesh)
+    ]
 
 
-def every(*place: Any) -> CellClass:
-    return CELL_CLASSES[(DELAYS_MS.index(place[0]) + DAMPINGS.index(place[1])) % 4]
+def every(*point: Any) -> CellClass:
+    return CELL_CLASSES[(DELAYS_MS.index(point[0]) + DAMPINGS.index(point[1])) % 4]
 
 
 def test_every_place_has_the_colour_of_its_verdict() -> None:
-    made = figure(drawn(every))
-    made.canvas.draw()
-    (mesh,) = meshes(made)[:1]
+    figure_of_map = figure(make_plane(every))
+    figure_of_map.canvas.draw()
+    (mesh,) = meshes(figure_of_map)[:1]
     colours = mesh.get_facecolors().reshape(len(DAMPINGS), len(DELAYS_MS), 4)
     for i, d in enumerate(DAMPINGS):
         for j, delay in enumerate(DELAYS_MS):
@@ -137,14 +140,17 @@ def test_every_place_has_the_colour_of_its_verdict() -> None:
 
 
 def test_a_place_reaches_half_way_to_the_next() -> None:
-    (mesh,) = meshes(figure(drawn()))[:1]
+    (mesh,) = meshes(figure(make_plane()))[:1]
     corners = mesh.get_coordinates()
     assert np.allclose(corners[0, :, 0], [0, 50, 150, 250, 350, 450])
     assert np.allclose(corners[:, 0, 1], [0, 0.45, 0.95, 1.45, 1.95, 2.45])
 
 
-def test_classes_are_apart_in_lightness() -> None:
-    """Grey print: luminance after Rec. 709; white stands for undecided, and is hatched besides."""
+def test_classes_differ_in_lightness() -> None:
+    """Grey print: luminance after Rec.
+
+    709; white stands for undecided, and is hatched besides.
+    """
     light = [
         float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES
     ]
@@ -153,31 +159,37 @@ def test_classes_are_apart_in_lightness() -> None:
 
 
 def test_lines_are_drawn_where_they_are_and_named() -> None:
-    made = figure(drawn(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
-    first, second = (one for one in made.axes[0].collections if isinstance(one, QuadContourSet))
+    figure_of_lines = figure(
+        make_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1))
+    )
+    first, second = (
+        collection
+        for collection in figure_of_lines.axes[0].collections
+        if isinstance(collection, QuadContourSet)
+    )
     for line in (first, second):
         ends = np.concatenate([path.vertices for path in line.get_paths()])
         assert np.allclose(ends[:, 1], 5e-3 * ends[:, 0])
         assert ends[:, 1].max() - ends[:, 1].min() > 2.0
     assert first.get_linestyle() != second.get_linestyle()
-    (legend,) = made.legends
-    words = [text.get_text() for text in legend.get_texts()]
-    assert words == ["converged", "bounded oscillation", "$d$", "linear analysis"]
+    (legend,) = figure_of_lines.legends
+    label_texts = [text.get_text() for text in legend.get_texts()]
+    assert label_texts == ["converged", "bounded oscillation", "$d$", "linear analysis"]
 
 
-def test_the_legend_has_only_what_occurs() -> None:
-    (legend,) = figure(drawn(lambda *_, **__: CellClass.UNDECIDED)).legends
+def test_the_legend_has_only_occurring_classes() -> None:
+    (legend,) = figure(make_plane(lambda *_, **__: CellClass.UNDECIDED)).legends
     assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
 
 
 def test_several_runs_show_their_share_with_a_scale() -> None:
-    plane = drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4)
-    made = figure(plane, 7.0)
-    share = meshes(made)[0].get_array()
+    plane = make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4)
+    figure_of_runs = figure(plane, 7.0)
+    share = meshes(figure_of_runs)[0].get_array()
     assert share is not None
     assert np.allclose(np.ma.getdata(share), plane.panels[0].share)
-    assert "share of stable runs" in [axes.get_ylabel() for axes in made.axes]
-    texts = {text.get_text() for text in made.axes[0].texts}
+    assert "share of stable runs" in [axes.get_ylabel() for axes in figure_of_runs.axes]
+    texts = {text.get_text() for text in figure_of_runs.axes[0].texts}
     assert texts
     for i, j in np.argwhere((plane.panels[0].share > 0.0) & (plane.panels[0].share < 1.0)):
         assert f"{round(4 * plane.panels[0].share[i, j])}/4" in texts
@@ -185,40 +197,43 @@ def test_several_runs_show_their_share_with_a_scale() -> None:
 
 
 @pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
-def test_every_panel_has_a_title_and_shares_one_label(panels: int, width_in: float) -> None:
-    plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
-    made = figure(plane, width_in, (LINE,))
-    assert made.get_figwidth() == width_in
-    assert [axes.get_title() for axes in made.axes if axes.collections] == [
+def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) -> None:
+    plane = make_plane(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
+    figure_of_panels = figure(plane, width_in, (LINE,))
+    assert figure_of_panels.get_figwidth() == width_in
+    assert [axes.get_title() for axes in figure_of_panels.axes if axes.collections] == [
         p.title for p in plane.panels
     ]
-    labels = [made.get_supxlabel(), *(axes.get_xlabel() for axes in made.axes)]
+    labels = [
+        figure_of_panels.get_supxlabel(),
+        *(axes.get_xlabel() for axes in figure_of_panels.axes),
+    ]
     assert [text for text in labels if text] == ["delay (ms)"]
 
 
-def test_nothing_of_matplotlib_is_left_changed() -> None:
+def test_settings_of_matplotlib_stay_unchanged() -> None:
     before = dict(mpl.rcParams)
-    figure(drawn())
+    figure(make_plane())
     assert dict(mpl.rcParams) == before
 
 
-def test_a_place_that_did_not_run_is_no_verdict() -> None:
+def test_a_place_without_run_is_no_verdict() -> None:
     from trilat_studies.sweep.stability_map import build_plane
 
     from .maps import KEYS, P_D
 
-    made = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
-    classes = meshes(made)[0].get_array()
+    figure_of_gap = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
+    classes = meshes(figure_of_gap)[0].get_array()
     assert classes is not None
     assert int(np.ma.getmaskarray(classes).sum()) == 1
 
 
 def test_uneven_values_are_named_one_by_one() -> None:
-    plane = drawn()
+    plane = make_plane()
     uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
-    made = figure(uneven)
-    made.canvas.draw()
-    assert [text.get_text() for text in made.axes[0].get_xticklabels()] == [
+    figure_of_values = figure(uneven)
+    figure_of_values.canvas.draw()
+    assert [text.get_text() for text in figure_of_values.axes[0].get_xticklabels()] == [
         "8",
         "68",
         "136",
@@ -233,7 +248,7 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 @pytest.mark.parametrize("panels", [(0.0,), (0.0, 400.0)])
 @pytest.mark.parametrize("width_in", [3.5, 7.0])
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
-    plane = drawn(link__playout_ms=panels)
+    plane = make_plane(link__playout_ms=panels)
     figure = draw_stability_map(
         plane, [()] * len(plane.panels), make_print_size(width_in), FIXED
     )
@@ -248,9 +263,9 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
     for other in others:
         assert other is not None
         assert not box.overlaps(other)
-    words = " ".join(caption.get_text().split())
-    assert words.startswith(f"not swept: {'; '.join(FIXED)}")
-    assert "trilat compare --tune" in words
+    caption_text = " ".join(caption.get_text().split())
+    assert caption_text.startswith(f"not swept: {'; '.join(FIXED)}")
+    assert "trilat compare --tune" in caption_text
 
 
 @pytest.mark.parametrize(
@@ -269,7 +284,7 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
 def test_gains_that_were_not_swept_are_named(
     axes: list[str], laws: list[str], texts: list[str]
 ) -> None:
-    found = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
-    assert len(found) == len(texts)
-    for one, text in zip(found, texts, strict=True):
+    gains = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
+    assert len(gains) == len(texts)
+    for one, text in zip(gains, texts, strict=True):
         assert one.startswith(text)

@@ -1,4 +1,4 @@
-"""Plans: axes are texts that a person would write; what cannot run is refused before anything does."""
+"""Plans: axes are texts as a person would write them; impossible plans are refused before any run."""
 
 import json
 from decimal import Decimal
@@ -20,7 +20,7 @@ from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 
-from .quick import SHORT, asked
+from .quick import SHORT, plan_quick_sweep
 
 
 def refused(source: str, *overrides: str, **settings: object) -> str:
@@ -32,9 +32,11 @@ def refused(source: str, *overrides: str, **settings: object) -> str:
 
 @pytest.fixture(scope="module")
 def cube(tmp_path_factory: pytest.TempPathFactory) -> SweepPlan:
-    """Two laws, and three axes."""
+    """Returns a request with two laws and three axes."""
     over = ["link.delay_ms=0:40:20", "sites.s.q0_rad.0=0.1,0.2", "link.order=newest,in_order"]
-    return asked(tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"])
+    return plan_quick_sweep(
+        tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"]
+    )
 
 
 @given(
@@ -57,10 +59,10 @@ VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
     counts=st.lists(st.integers(0, 50), min_size=1, unique=True),
     as_array=st.booleans(),
 )
-def test_values_by_key_are_the_axes_that_texts_are(
+def test_values_by_key_equal_axes_as_texts(
     delays: list[float], counts: list[int], as_array: bool
 ) -> None:
-    given = [np.array(one) if as_array else one for one in (delays, counts)]
+    given = [np.array(axes) if as_array else axes for axes in (delays, counts)]
     over = {
         "link.delay_ms": given[0],
         "control.d": given[1],
@@ -73,7 +75,7 @@ def test_values_by_key_are_the_axes_that_texts_are(
     assert list_axes("link.delay_ms=0:400:50") == list_axes({"link.delay_ms": "0:400:50"})
 
 
-def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
+def test_laws_may_be_classes_and_vectors_single_values() -> None:
     laws, poses = list_axes({"control.law": [Adaptive, "p_d"], "sites.s.q0_rad": np.eye(2)})
     assert laws == 'control.law="tests.laws:Adaptive",p_d'
     assert len(parse_axis(laws).texts) == len(parse_axis(poses).texts) == 2
@@ -82,9 +84,7 @@ def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
 
 
 @given(number=st.integers(0, 23), seed=st.integers(1, 3))
-def test_a_cell_is_what_its_overrides_make_of_the_scenario(
-    cube: SweepPlan, number: int, seed: int
-) -> None:
+def test_a_cell_is_its_scenario_with_overrides(cube: SweepPlan, number: int, seed: int) -> None:
     scenario = cube.scenario(*cube.cell(number).overrides, f"seed={seed}")
     delay_ms, pose, order = cube.cell(number).values
     assert {link.delay_ms for link in scenario.links.values()} == {delay_ms}
@@ -103,7 +103,7 @@ def test_there_is_no_cell_beyond_the_last(cube: SweepPlan) -> None:
             cube.cell(number)
 
 
-def test_facts_make_the_plan_again(cube: SweepPlan) -> None:
+def test_facts_restore_the_plan(cube: SweepPlan) -> None:
     again = plan_from_json(json.loads(json.dumps(cube.facts())))
     assert again.facts() == cube.facts()
     assert again.base == cube.base
@@ -111,34 +111,34 @@ def test_facts_make_the_plan_again(cube: SweepPlan) -> None:
     assert (again.seeds, again.longest_s) == (cube.seeds, cube.longest_s)
 
 
-def test_law_that_all_sites_have_keeps_gains_of_scenario() -> None:
-    found = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
-    stays, other = (found.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
+def test_a_law_of_all_sites_keeps_its_gains() -> None:
+    plan = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
+    stays, other = (plan.scenario(*plan.cell(n).overrides).sites["s"].control for n in (0, 1))
     assert (stays.K, stays.d) == ((7.0, 7.0), (1.1, 1.1))
     assert (other.K, other.Kd, other.d) == ((7.0, 7.0), (3.0, 3.0), (5.0, 5.0))
 
 
 def test_another_law_replaces_every_sites_law_and_gains() -> None:
-    found = plan_sweep("contact", laws=["p_f", "p_d"])
-    assert found.cell(0).overrides == ()
-    of_all = found.scenario(*found.cell(1).overrides)
+    plan = plan_sweep("contact", laws=["p_f", "p_d"])
+    assert plan.cell(0).overrides == ()
+    of_all = plan.scenario(*plan.cell(1).overrides)
     assert {spec.control for spec in of_all.sites.values()} == {
         load_scenario("paper", ["control.law=p_d"]).sites["s"].control
     }
 
 
-def test_seeds_are_counted_from_the_scenarios_own_or_named(tmp_path: Path) -> None:
-    assert asked(tmp_path).seeds == (1,)
-    assert asked(tmp_path, "seed=5", seeds=3).seeds == (5, 6, 7)
-    assert asked(tmp_path, seeds=[4, 2, 4]).seeds == (4, 2)
+def test_seeds_count_from_the_scenarios_or_are_named(tmp_path: Path) -> None:
+    assert plan_quick_sweep(tmp_path).seeds == (1,)
+    assert plan_quick_sweep(tmp_path, "seed=5", seeds=3).seeds == (5, 6, 7)
+    assert plan_quick_sweep(tmp_path, seeds=[4, 2, 4]).seeds == (4, 2)
     assert "1 to 100000" in refused("paper", seeds=0)
     assert "1 to 100000" in refused("paper", seeds=100_001)
     assert "from 0 to 2^63 - 1, not -1" in refused("paper", seeds=[-1])
 
 
-def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
-    assert asked(tmp_path).longest_s == 4.0
-    assert asked(tmp_path, longest_s=0.5).longest_s == 0.5
+def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
+    assert plan_quick_sweep(tmp_path).longest_s == 4.0
+    assert plan_quick_sweep(tmp_path, longest_s=0.5).longest_s == 0.5
     assert plan_sweep("paper", ["duration_s=80000"]).longest_s == 86_400.0
     for longest_s in (0.4, 1e6, float("nan")):
         assert "from 0.5 s to 86400 s" in refused(
@@ -147,7 +147,7 @@ def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("over", "words"),
+    ("over", "phrases"),
     [
         (
             ["link.delay=0:1:1"],
@@ -164,17 +164,17 @@ def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
         (["link.delay_ms=0,1", "link.delay_ms=2,3"], ("link.delay_ms: is swept twice",)),
     ],
 )
-def test_axis_that_cannot_be_right_is_refused_before_anything_runs(
-    over: list[str], words: tuple[str, ...]
+def test_invalid_axes_are_refused_before_any_run(
+    over: list[str], phrases: tuple[str, ...]
 ) -> None:
     problem = refused("p_d_margin", over=over)
-    for word in words:
+    for word in phrases:
         assert word in problem
 
 
-def test_a_key_that_nothing_follows_is_refused(tmp_path: Path) -> None:
-    own = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
-    (tmp_path / "own.toml").write_text(own)
+def test_a_key_without_effect_is_refused(tmp_path: Path) -> None:
+    text = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
+    (tmp_path / "own.toml").write_text(text)
     problem = refused(str(tmp_path / "own.toml"), over=["control.Kd=1:3:1"])
     assert "control.Kd: 1 and 2 give the same experiment" in problem
     assert "sites.NAME.control" in problem
@@ -190,7 +190,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("laws", "words"),
+    ("laws", "phrases"),
     [
         (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
         (
@@ -200,13 +200,15 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
         (["p_d", "p_f"], ("with law p_f", "two sites")),
     ],
 )
-def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str, ...]) -> None:
+def test_a_law_that_cannot_be_swept_is_refused(
+    laws: list[str], phrases: tuple[str, ...]
+) -> None:
     problem = refused("p_d_margin", laws=laws)
-    for word in words:
+    for word in phrases:
         assert word in problem
 
 
-def test_axis_that_swept_law_has_not_is_refused_with_law() -> None:
+def test_axes_the_swept_law_lacks_are_refused() -> None:
     problem = refused("p_d_margin", over=["control.d=1,2"], laws=["p_d", "adaptive"])
     assert "control.d: with law adaptive: belongs to law" in problem
     assert "is swept twice" in refused(
@@ -231,52 +233,52 @@ def axis_refused(text: str) -> str:
     count=st.integers(1, 300),
     beyond=st.decimals(0, Decimal("0.9"), places=2),
 )
-def test_a_range_is_whole_steps_from_its_first_value(
+def test_a_range_is_whole_steps_from_its_start(
     first: Decimal, step: Decimal, count: int, beyond: Decimal
 ) -> None:
     last = first + (count - 1 + beyond) * step
-    found = parse_axis(f"control.d={first}:{last}:{step}")
-    assert len(found.texts) == count
-    assert found.numeric
-    values = [Decimal(text) for text in found.texts]
+    axis = parse_axis(f"control.d={first}:{last}:{step}")
+    assert len(axis.texts) == count
+    assert axis.numeric
+    values = [Decimal(text) for text in axis.texts]
     assert values == [first + n * step for n in range(count)]
-    assert [found.value(n) for n in range(count)] == [float(value) for value in values]
+    assert [axis.value(n) for n in range(count)] == [float(value) for value in values]
     downwards = parse_axis(f"control.d={values[-1]}:{first}:{-step}")
     assert [Decimal(text) for text in downwards.texts] == values[::-1]
 
 
-def test_an_end_on_the_grid_within_rounding_counts() -> None:
+def test_an_end_on_the_grid_is_included() -> None:
     assert list(parse_axis("a=0:1:0.3333333333").texts)[-1] == "0.9999999999"
     assert list(parse_axis("a=0:0.9999999999:0.25").texts)[-1] == "1.00"
 
 
-def test_exponents_are_written_out_so_that_whole_numbers_stay_whole() -> None:
+def test_written_exponents_keep_whole_numbers_whole() -> None:
     assert list(parse_axis("rate_hz=1e2:3e2:1e2").texts) == ["100", "200", "300"]
     assert list(parse_axis("a=1e-7:2e-7:1e-7").texts) == ["0.0000001", "0.0000002"]
 
 
-def test_a_list_has_words_numbers_and_tables() -> None:
-    found = parse_axis(" link.order = newest, in_order ")
-    assert (found.description, found.key, found.texts) == (
+def test_a_list_may_hold_words_numbers_and_tables() -> None:
+    axis = parse_axis(" link.order = newest, in_order ")
+    assert (axis.description, axis.key, axis.texts) == (
         "link.order=newest, in_order",
         "link.order",
         ("newest", "in_order"),
     )
-    assert (found.numeric, found.value(1)) == (False, "in_order")
+    assert (axis.numeric, axis.value(1)) == (False, "in_order")
     assert parse_axis("a=1,2.5,1e3").numeric
     assert parse_axis("a=true,false").value(0) == "true"
     assert parse_axis("q0_rad=[0.1,0.2],[0.3,0.4]").texts == ("[0.1,0.2]", "[0.3,0.4]")
     assert parse_axis('a="x:y,z",{b="]:,"}').texts == ('"x:y,z"', '{b="]:,"}')
 
 
-def test_a_range_of_very_many_values_takes_no_room() -> None:
-    found = parse_axis("a=0:1e8:0.001")
-    assert len(found.texts) == 10**11 + 1
-    assert found.texts[10**11] == "100000000.000"
+def test_huge_ranges_take_no_memory() -> None:
+    axis = parse_axis("a=0:1e8:0.001")
+    assert len(axis.texts) == 10**11 + 1
+    assert axis.texts[10**11] == "100000000.000"
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "phrases"),
     [
         ("link.delay_ms", ("KEY=VALUES", "'link.delay_ms'")),
         ("=1,2", ("KEY=VALUES",)),
@@ -302,9 +304,11 @@ def test_a_range_of_very_many_values_takes_no_room() -> None:
         ("duration_s=1,2", ("longest_s",)),
     ],
 )
-def test_an_invalid_axis_is_refused_with_a_valid_one(text: str, words: tuple[str, ...]) -> None:
+def test_invalid_axes_beside_valid_ones_are_refused(
+    text: str, phrases: tuple[str, ...]
+) -> None:
     problem = axis_refused(text)
-    for word in words:
+    for word in phrases:
         assert word in problem
 
 
@@ -320,7 +324,7 @@ def test_an_invalid_axis_is_refused_with_a_valid_one(text: str, words: tuple[str
         (["link.model=uniform", "control.d=2"], ["p_d", "pd_d"]),
     ],
 )
-def test_overrides_may_need_what_is_swept(overrides: list[str], laws: list[str]) -> None:
+def test_overrides_may_need_swept_values(overrides: list[str], laws: list[str]) -> None:
     plan = plan_sweep("free", overrides, over=["link.delay_ms=20:60:20"], laws=laws)
     again = plan_from_json(json.loads(json.dumps(plan.facts())))
     assert again.facts() == plan.facts()

@@ -20,21 +20,21 @@ from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.scenario_reader import list_shipped
 
-from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
+from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, judge_by_condition, make_plane, rows
 
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
-def test_every_run_is_counted_once_in_whatever_order_they_come(
-    order: list[int], chance: int
-) -> None:
+def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> None:
     random = np.random.default_rng(chance)
-    made = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
-    found = build_plane([made[n] for n in order], KEYS, P_D)
-    (panel,) = found.panels
+    shuffled_rows = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
+    plane = build_plane([shuffled_rows[n] for n in order], KEYS, P_D)
+    (panel,) = plane.panels
     assert panel.counts.sum() == 50
-    for row in made:
+    for row in shuffled_rows:
         i, j = DAMPINGS.index(row[KEYS[1]]), DELAYS_MS.index(row[KEYS[0]])
-        same = [r for r in made if (r[KEYS[0]], r[KEYS[1]]) == (row[KEYS[0]], row[KEYS[1]])]
+        same = [
+            r for r in shuffled_rows if (r[KEYS[0]], r[KEYS[1]]) == (row[KEYS[0]], row[KEYS[1]])
+        ]
         for n, verdict in enumerate(CELL_CLASSES):
             assert panel.counts[i, j, n] == sum(r["verdict"] == verdict for r in same)
 
@@ -46,46 +46,46 @@ def test_the_share_is_of_decided_runs() -> None:
         CellClass.UNDECIDED,
         CellClass.CONVERGED,
     )
-    found = drawn(lambda *place: verdicts[place[-1] - 1], seeds=4)
-    assert np.allclose(found.panels[0].share, 2.0 / 3.0)
-    assert found.seeds == 4
+    plane = make_plane(lambda *place: verdicts[place[-1] - 1], seeds=4)
+    assert np.allclose(plane.panels[0].share, 2.0 / 3.0)
+    assert plane.seeds == 4
 
 
-def test_nothing_decided_has_no_share() -> None:
-    assert np.isnan(drawn(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
+def test_undecided_places_have_no_share() -> None:
+    assert np.isnan(make_plane(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
 
 
 def test_words_and_further_axes_make_panels() -> None:
-    found = drawn(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
-    assert [panel.title for panel in found.panels] == [
+    plane = make_plane(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
+    assert [panel.title for panel in plane.panels] == [
         "newest, playout 0 ms",
         "newest, playout 400 ms",
         "in order, playout 0 ms",
         "in order, playout 400 ms",
     ]
-    assert found.panels[1].settings == (("link.order", "newest"), ("link.playout_ms", 400.0))
-    assert {int(panel.counts.sum()) for panel in found.panels} == {
+    assert plane.panels[1].settings == (("link.order", "newest"), ("link.playout_ms", 400.0))
+    assert {int(panel.counts.sum()) for panel in plane.panels} == {
         len(DELAYS_MS) * len(DAMPINGS)
     }
 
 
 def test_an_axis_of_words_is_never_drawn() -> None:
-    made = list(rows(link__order=("newest", "in_order")))
-    found = build_plane(made, ["link.order", *KEYS], P_D)
-    assert (found.x.key, found.y.key) == KEYS
-    assert len(found.panels) == 2
+    ordered_rows = list(rows(link__order=("newest", "in_order")))
+    plane = build_plane(ordered_rows, ["link.order", *KEYS], P_D)
+    assert (plane.x.key, plane.y.key) == KEYS
+    assert len(plane.panels) == 2
 
 
 def test_a_single_axis_is_a_strip() -> None:
-    found = build_plane(
+    plane = build_plane(
         [row for row in rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D
     )
-    assert (found.y.key, found.y.values) == ("", (0.0,))
-    assert found.panels[0].counts.shape == (1, 5, 4)
+    assert (plane.y.key, plane.y.values) == ("", (0.0,))
+    assert plane.panels[0].counts.shape == (1, 5, 4)
 
 
 def test_whole_numbers_stay_whole() -> None:
-    assert all(isinstance(value, int) for value in drawn().x.values)
+    assert all(isinstance(value, int) for value in make_plane().x.values)
 
 
 @pytest.mark.parametrize(
@@ -97,27 +97,27 @@ def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool
     assert side.positions.tolist() == list(values if even else range(len(values)))
 
 
-def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
+def test_no_runs_numbers_or_panels_are_refused() -> None:
     with pytest.raises(UsageError, match="no cell has run"):
         build_plane([], KEYS, P_D)
     with pytest.raises(UsageError, match=r"needs a numeric axis, .* not numbers: link\.order"):
         build_plane(list(rows(link__order=("newest", "in_order"))), ["link.order"], P_D)
     with pytest.raises(UsageError, match=r"at most 12 panels, but rate_hz would give 13"):
-        drawn(rate_hz=tuple(range(13)))
+        make_plane(rate_hz=tuple(range(13)))
 
 
 YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 
-def up(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
-    """The edges of the first column of a map in which all are like this one."""
-    found = drawn(lambda _, d, *__: column[DAMPINGS.index(d)])
-    return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]
+def list_column_edges(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
+    """Returns the edges of the first column of a map whose columns are alike."""
+    plane = make_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
+    return [edge for x, edge in find_map_edges(plane, plane.panels[0]) if x == DELAYS_MS[0]]
 
 
-def test_the_condition_lies_in_the_edges_that_it_makes() -> None:
-    found = drawn()
-    measured = find_map_edges(found, found.panels[0])
+def test_the_condition_lies_in_its_own_edges() -> None:
+    plane = make_plane()
+    measured = find_map_edges(plane, plane.panels[0])
     assert [x for x, _ in measured] == [100, 200, 300, 400]
     for x, edge in measured:
         assert edge.low <= 5e-3 * x <= edge.high
@@ -125,29 +125,39 @@ def test_the_condition_lies_in_the_edges_that_it_makes() -> None:
 
 
 @pytest.mark.parametrize("column", list(itertools.product((YES, NO, UNKNOWN), repeat=5))[::7])
-def test_edges_separate_all_that_was_decided(column: tuple[CellClass, ...]) -> None:
+def test_edges_separate_all_decided_places(column: tuple[CellClass, ...]) -> None:
     """From below, the side changes at every edge and nowhere else."""
-    found = up(column)
+    edges = list_column_edges(column)
     side = [verdict.stable for verdict in column]
-    decided = [(d, one) for d, one in zip(DAMPINGS, side, strict=True) if one is not None]
+    decided = [
+        (d, is_stable)
+        for d, is_stable in zip(DAMPINGS, side, strict=True)
+        if is_stable is not None
+    ]
     changes = [
         (a, b) for (a, one), (b, other) in itertools.pairwise(decided) if one is not other
     ]
-    assert [(edge.low, edge.high) for edge in found] == changes
-    for edge in found:
+    assert [(edge.low, edge.high) for edge in edges] == changes
+    for edge in edges:
         assert edge.stable_below is (side[DAMPINGS.index(edge.low)])
 
 
-def test_what_is_undecided_widens_an_edge() -> None:
-    (edge,) = up((NO, UNKNOWN, UNKNOWN, YES, YES))
+def test_undecided_places_widen_an_edge() -> None:
+    (edge,) = list_column_edges((NO, UNKNOWN, UNKNOWN, YES, YES))
     assert (edge.low, edge.high, edge.middle) == (0.2, 1.7, pytest.approx(0.95))
 
 
-def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
-    """Per place seeds 1 and 2 as the line says; below, seed 3 another way: a majority of two of three."""
-    three = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 3 else YES, seeds=3)
-    assert find_map_edges(three, three.panels[0]) == find_map_edges(drawn(), drawn().panels[0])
-    draw = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 2 or y > 1.0 else YES, seeds=2)
+def test_majorities_of_runs_decide_and_draws_do_not() -> None:
+    """Per place seeds 1 and 2 follow the line, and seed 3 contradicts: a majority of two of three."""
+    three = make_plane(
+        lambda x, y, seed: judge_by_condition(x, y) if seed < 3 else YES, seeds=3
+    )
+    assert find_map_edges(three, three.panels[0]) == find_map_edges(
+        make_plane(), make_plane().panels[0]
+    )
+    draw = make_plane(
+        lambda x, y, seed: judge_by_condition(x, y) if seed < 2 or y > 1.0 else YES, seeds=2
+    )
     assert all(
         edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0])
     )
@@ -171,11 +181,11 @@ def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
         ("sites.s.q0_rad.1", "q0[1] of s (rad)"),
     ],
 )
-def test_a_key_is_told_in_its_words_and_its_unit(key: str, text: str) -> None:
+def test_keys_are_shown_in_words_with_units(key: str, text: str) -> None:
     assert label_axis(key) == text
 
 
-def test_what_a_number_means_is_told_by_the_scenario() -> None:
+def test_the_scenario_gives_a_numbers_meaning() -> None:
     key = "sites.s.environment.0.stiffness_n_m"
     assert label_axis(key, load_scenario("contact")) == "stiffness, wall of s (N/m)"
     assert (
@@ -184,7 +194,7 @@ def test_what_a_number_means_is_told_by_the_scenario() -> None:
     )
 
 
-def test_every_suffix_of_shipped_arm_and_its_limits_is_unit() -> None:
+def test_suffixes_of_shipped_arms_and_limits_are_units() -> None:
     """No label shows a piece of a unit as if it were a word."""
     spec = next(iter(load_scenario(list_shipped()[0]).sites.values()))
     for table in (spec.arm, spec.limits):
@@ -194,7 +204,7 @@ def test_every_suffix_of_shipped_arm_and_its_limits_is_unit() -> None:
                 assert label_axis(f"arm.{field}").endswith(")"), field
 
 
-def test_a_place_is_its_value_in_its_unit() -> None:
+def test_a_place_is_shown_in_its_unit() -> None:
     assert label_setting("link.playout_ms", 400.0) == "playout 400 ms"
     assert label_setting("link.loss", 0.25) == "loss 0.25"
     assert label_setting("link.order", "in_order") == "order in order"

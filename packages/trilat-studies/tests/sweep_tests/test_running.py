@@ -1,4 +1,4 @@
-"""Runs of a sweep: the same results however they were made, nothing twice, every run counted."""
+"""Runs of a sweep: results do not depend on how they were made, and every run is made and counted once."""
 
 from collections import Counter
 from pathlib import Path
@@ -21,20 +21,20 @@ from trilat_studies.sweep.sweep_run import (
 
 from trilat_net.errors import ScenarioError, UsageError
 
-from .quick import DELAYS, Judge, asked
+from .quick import DELAYS, Judge, plan_quick_sweep
 
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
-    found = Judge()
-    monkeypatch.setattr(sweep_cell, "classify_cell", found)
-    return found
+    text_judge = Judge()
+    monkeypatch.setattr(sweep_cell, "classify_cell", text_judge)
+    return text_judge
 
 
 @pytest.mark.long
-def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
+def test_the_number_of_processes_changes_no_byte(tmp_path: Path) -> None:
     """The judge of the package, in this process and in two others."""
-    sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
+    sweep = plan_quick_sweep(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
     alone, others = (
         run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2)
     )
@@ -50,7 +50,7 @@ class _StopError(Exception):
 
 
 def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> None:
-    sweep = asked(tmp_path, "link.loss=0.2", seeds=2)
+    sweep = plan_quick_sweep(tmp_path, "link.loss=0.2", seeds=2)
     run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1)
     whole = (tmp_path / "whole" / RESULTS_FILE).read_bytes()
     texts = judge.texts.copy()
@@ -75,21 +75,21 @@ def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> Non
     assert 0 < swept.runs < 24
 
 
-def test_one_seed_is_run_where_nothing_is_random(tmp_path: Path, judge: Judge) -> None:
-    told: list[tuple[int, int]] = []
-    sweep = asked(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
+def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> None:
+    progress: list[tuple[int, int]] = []
+    sweep = plan_quick_sweep(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
     rows = run_sweep(
-        prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: told.append(one)
+        prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: progress.append(one)
     ).results.rows
     seeds_of = [(row["cell"], row["seed"]) for row in rows]
     assert seeds_of == [(0, 1), *((1, seed) for seed in range(1, 6)), (2, 1)]
     assert [row["random"] for row in rows] == [False, *[True] * 5, False]
-    assert told == [(1, 3), (2, 3), (3, 3), (4, 7), (5, 7), (6, 7), (7, 7)]
+    assert progress == [(1, 3), (2, 3), (3, 3), (4, 7), (5, 7), (6, 7), (7, 7)]
     assert len(judge.texts) == 7
 
 
-def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge) -> None:
-    sweep = asked(tmp_path)
+def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> None:
+    sweep = plan_quick_sweep(tmp_path)
     expected = estimate_sweep(sweep, jobs=1)
     assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
     assert (expected.runs, expected.seconds > 0.0) == (12, True)
@@ -100,15 +100,16 @@ def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge
     assert estimate_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(0, 0.0, [])
 
 
-def test_an_estimate_counts_seeds_where_something_is_random(
-    tmp_path: Path, judge: Judge
-) -> None:
-    assert estimate_sweep(asked(tmp_path, seeds=10), jobs=1).runs == 12
-    assert estimate_sweep(asked(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs == 120
+def test_an_estimate_counts_seeds_of_random_links(tmp_path: Path, judge: Judge) -> None:
+    assert estimate_sweep(plan_quick_sweep(tmp_path, seeds=10), jobs=1).runs == 12
+    assert (
+        estimate_sweep(plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs
+        == 120
+    )
     assert judge.texts
 
 
-def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> None:
+def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
     over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
     sweep = plan_sweep("p_d_margin", over=over)
     with pytest.raises(UsageError) as error:
@@ -131,8 +132,10 @@ def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> 
 
 
 def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
-    """The ends of both axes are fine alone and together; a pair between them is not."""
-    sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
+    """The ends of both axes are valid alone and together; one pair between them is not."""
+    sweep = plan_quick_sweep(
+        tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"]
+    )
     folder = prepare_sweep_folder(sweep, tmp_path / "o")
     with pytest.raises(
         ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"
@@ -144,7 +147,7 @@ def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
 
 
 def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
-    sweep = asked(
+    sweep = plan_quick_sweep(
         tmp_path,
         over=["control.Kd=0.2:3:0.1", DELAYS],
         laws=["pd_d", "adaptive"],
@@ -163,7 +166,7 @@ def test_a_summary_counts_every_run_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    sweep = asked(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
+    sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
     results = run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
     first, *others = summarize_sweep(results)
     assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")

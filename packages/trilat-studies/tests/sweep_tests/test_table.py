@@ -1,4 +1,4 @@
-"""Results: what was run, number for number, in a file that other programs read; shares with intervals."""
+"""Results: every run, number for number, in a file that other programs read; shares with intervals."""
 
 import csv
 import json
@@ -25,23 +25,31 @@ from trilat_studies.sweep.sweep_results import (
 from trilat_net.errors import UsageError
 from trilat_net.work.intervals import wilson_interval
 
-from .quick import DELAYS, Judge, asked, outcome_of
+from .quick import DELAYS, Judge, outcome_of, plan_quick_sweep
 
 ORDERS = "link.order=newest,in_order"
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults, Judge]:
-    """Numbers and words, two laws, two seeds where something is random; its folder, and who judged."""
+def finished_sweep(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, SweepResults, Judge]:
+    """A sweep of numbers and words, two laws, and two seeds where links are random: its folder,
+    and its judge.
+    """
     path = tmp_path_factory.mktemp("swept")
-    sweep = asked(path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2)
+    sweep = plan_quick_sweep(
+        path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2
+    )
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(sweep_cell, "classify_cell", judge := Judge())
         return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
 
 
-def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -> None:
-    path, results, judge = swept
+def test_the_read_runs_are_the_written_ones(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, judge = finished_sweep
     again = read_results(path)
     assert list(again.rows) == list(results.rows)
     assert again.plan.facts() == results.plan.facts()
@@ -54,10 +62,10 @@ def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -
         )
 
 
-def test_rows_are_in_the_order_of_cells_and_seeds(
-    swept: tuple[Path, SweepResults, Judge],
+def test_rows_are_ordered_by_cells_and_seeds(
+    finished_sweep: tuple[Path, SweepResults, Judge],
 ) -> None:
-    _, results, _ = swept
+    _, results, _ = finished_sweep
     assert [(row["cell"], row["seed"]) for row in results.rows] == [
         (cell, seed) for cell in range(8) for seed in ((1, 2) if cell % 4 >= 2 else (1,))
     ]
@@ -69,10 +77,10 @@ def test_rows_are_in_the_order_of_cells_and_seeds(
         results.of_cell(8)
 
 
-def test_bytes_do_not_depend_on_order_in_which_runs_ended(
-    swept: tuple[Path, SweepResults, Judge],
+def test_the_order_of_finished_runs_changes_no_byte(
+    finished_sweep: tuple[Path, SweepResults, Judge],
 ) -> None:
-    path, results, _ = swept
+    path, results, _ = finished_sweep
     with prepare_sweep_folder(results.plan, path).journal() as journal:
         entries = list(journal.done.values())
     for order in (entries, entries[::-1]):
@@ -80,8 +88,10 @@ def test_bytes_do_not_depend_on_order_in_which_runs_ended(
         assert table.encode() == (path / "results.csv").read_bytes()
 
 
-def test_csv_readers_find_every_number(swept: tuple[Path, SweepResults, Judge]) -> None:
-    path, results, _ = swept
+def test_csv_readers_find_every_number(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, _ = finished_sweep
     with (path / "results.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     for line, row in zip(lines, results.rows, strict=True):
@@ -96,9 +106,11 @@ def test_csv_readers_find_every_number(swept: tuple[Path, SweepResults, Judge]) 
                 assert line[name] == str(value)
 
 
-def test_pandas_reads_the_types_of_columns(swept: tuple[Path, SweepResults, Judge]) -> None:
+def test_pandas_reads_the_types_of_columns(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
     pandas = pytest.importorskip("pandas")
-    path, results, _ = swept
+    path, results, _ = finished_sweep
     frame = pandas.read_csv(path / "results.csv")
     kinds = [str(frame.dtypes[name]) for name in ("link.loss", "cell", "random")]
     assert kinds == ["float64", "int64", "bool"]
@@ -106,8 +118,10 @@ def test_pandas_reads_the_types_of_columns(swept: tuple[Path, SweepResults, Judg
     assert list(frame["peak_error_rad"]) == pytest.approx(peaks_rad, rel=1e-15)
 
 
-def test_the_request_stands_beside_the_table(swept: tuple[Path, SweepResults, Judge]) -> None:
-    path, results, _ = swept
+def test_the_request_stands_beside_the_table(
+    finished_sweep: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, _ = finished_sweep
     facts = json.loads((path / "plan.json").read_text())
     assert facts["scenario_sha256"] == results.plan.base.sha256
     assert facts["text"] == results.plan.written.text
@@ -120,7 +134,7 @@ def test_a_sweep_needs_no_optional_package(
     for name in ("pandas", "polars", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    plan = asked(tmp_path, over=[DELAYS], seeds=2)
+    plan = plan_quick_sweep(tmp_path, over=[DELAYS], seeds=2)
     run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1)
     assert len(read_results(tmp_path / "o").rows) == 3
 
@@ -129,7 +143,7 @@ def test_a_very_long_scenario_is_read_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    plan = asked(tmp_path, over=[DELAYS])
+    plan = plan_quick_sweep(tmp_path, over=[DELAYS])
     rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
     rows[1] = {**rows[1], "scenario": '# "letters", and\r\n' + "x" * 300_000}
     (tmp_path / "o" / "results.csv").write_text(encode_results(plan, rows), newline="")
@@ -165,8 +179,8 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
     assert read_results(tmp_path).rows[1234]["scenario"].count("delay_ms = 240.0") == 6
 
 
-def test_a_run_that_diverged_is_given_time_to_diverge_again(tmp_path: Path) -> None:
-    sweep = asked(tmp_path, over=[DELAYS])
+def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
+    sweep = plan_quick_sweep(tmp_path, over=[DELAYS])
     outcomes = [outcome_of(str(n)) for n in range(100)]
     for outcome in outcomes:
         lasts_s = reproduction_duration_s(sweep, outcome)
@@ -176,14 +190,14 @@ def test_a_run_that_diverged_is_given_time_to_diverge_again(tmp_path: Path) -> N
             assert lasts_s == min(4.0, 0.5 * 2.0**outcome.extended) > outcome.diverged_s
 
 
-def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
-    def refused(path: Path, *words: str) -> None:
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    def refused(path: Path, *phrases: str) -> None:
         with pytest.raises(UsageError) as error:
             read_results(path)
-        for word in (str(path), *words):
+        for word in (str(path), *phrases):
             assert word in str(error.value)
 
-    begun = prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
+    begun = prepare_sweep_folder(plan_quick_sweep(tmp_path), tmp_path / "o").path
     refused(begun, "no results", f"trilat sweep --resume {begun}")
     refused(tmp_path / "none.csv", "no results")
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
@@ -206,7 +220,7 @@ def test_a_damaged_table_is_refused(
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     folder = run_sweep(
-        prepare_sweep_folder(asked(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
+        prepare_sweep_folder(plan_quick_sweep(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
     ).folder.path
     table = folder / "results.csv"
     table.write_text(damage(table.read_text()))
@@ -218,36 +232,34 @@ def test_a_damaged_table_is_refused(
 @pytest.fixture
 def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    sweep = asked(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
+    sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
     return collect_grid_points(
         run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
     )
 
 
 def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
-    assert [place.cell for place in points] == list(range(18))
-    assert [sum(place.counts) for place in points] == [1] * 3 + [12] * 15
-    for place in points:
-        converged, bounded, diverged, undecided = place.counts
-        assert (place.stable, place.decided) == (converged, converged + bounded + diverged)
-        assert place.decided + undecided == sum(place.counts)
-        assert place.doubtful == (0 < converged < place.decided)
-        assert place.interval == wilson_interval(converged, converged + bounded + diverged)
+    assert [point.cell for point in points] == list(range(18))
+    assert [sum(point.counts) for point in points] == [1] * 3 + [12] * 15
+    for point in points:
+        converged, bounded, diverged, undecided = point.counts
+        assert (point.stable, point.decided) == (converged, converged + bounded + diverged)
+        assert point.decided + undecided == sum(point.counts)
+        assert point.doubtful == (0 < converged < point.decided)
+        assert point.interval == wilson_interval(converged, converged + bounded + diverged)
 
 
-def test_they_stand_in_a_file_where_there_are_seeds(
-    points: list[GridPoint], tmp_path: Path
-) -> None:
+def test_random_cells_have_rows_of_shares(points: list[GridPoint], tmp_path: Path) -> None:
     with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
         lines = list(csv.DictReader(stream))
-    for line, place in zip(lines, points, strict=True):
+    for line, point in zip(lines, points, strict=True):
         row = {
             name: float(text) if text and name != "law" else None for name, text in line.items()
         }
-        assert tuple(row[verdict.value] for verdict in CellClass) == place.counts
-        assert (row["link.loss"], row["link.delay_ms"]) == place.values
-        assert (row["stable_share_low"], row["stable_share_high"]) == place.interval
-        if place.decided:
+        assert tuple(row[verdict.value] for verdict in CellClass) == point.counts
+        assert (row["link.loss"], row["link.delay_ms"]) == point.values
+        assert (row["stable_share_low"], row["stable_share_high"]) == point.interval
+        if point.decided:
             assert row["stable_share_low"] <= row["stable_share"] <= row["stable_share_high"]
         else:
             assert row["stable_share"] is None
@@ -270,7 +282,7 @@ def test_intervals_are_those_of_a_published_table(
 
 
 @pytest.mark.parametrize("runs", [10, 20, 100])
-def test_the_interval_holds_the_truth_95_times_of_100(runs: int) -> None:
+def test_intervals_hold_the_truth_in_95_percent(runs: int) -> None:
     """Coverage by the binomial sums, over even shares: 0.95 within 0.01; nowhere below 0.83."""
     shares = np.linspace(0.0005, 0.9995, 1000)
     held = np.zeros(len(shares))
@@ -282,5 +294,5 @@ def test_the_interval_holds_the_truth_95_times_of_100(runs: int) -> None:
     assert held.min() > 0.83
 
 
-def test_without_runs_nothing_is_known() -> None:
+def test_without_runs_no_share_is_known() -> None:
     assert wilson_interval(0, 0) == (0.0, 1.0)

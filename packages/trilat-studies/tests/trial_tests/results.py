@@ -1,4 +1,4 @@
-"""A scenario that takes milliseconds, and figures and results as a trial would have given them."""
+"""A scenario that takes milliseconds, and figures and results as a trial would return them."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ from trilat_studies.trials import Trial, TrialResult
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.code_consent import allow_own_code
 
 QUICK = """
 name = "quick"

@@ -1,4 +1,6 @@
-"""One definition of every metric: a run is measured as its log is, however it is cut into batches."""
+"""One definition of every metric: a run is measured as its log is, however the records are cut
+into batches.
+"""
 
 from itertools import pairwise
 from typing import Any
@@ -37,10 +39,10 @@ def scenario(**changes: Any) -> Scenario:
     return load_scenario("free", {**SHORT, **changes})
 
 
-def agree(one: RunMetrics, other: RunMetrics) -> None:
-    """Equal but for the last bits of means."""
+def agree(metrics: RunMetrics, other: RunMetrics) -> None:
+    """Asserts that figures are equal but for the last bits of means."""
     for field in RunMetrics.__struct_fields__:
-        a, b = getattr(one, field), getattr(other, field)
+        a, b = getattr(metrics, field), getattr(other, field)
         if field == "rms_error_rad":
             assert a == pytest.approx(b, rel=1e-12)
         elif field == "ages":
@@ -66,31 +68,31 @@ def agree(one: RunMetrics, other: RunMetrics) -> None:
     ],
     ids=["plain", "random", "rates", "diverged", "never heard of"],
 )
-def test_a_run_and_its_log_have_the_same_figures(changes: dict[str, Any]) -> None:
+def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None:
     assert scenario().ticks("m1") > BATCH_RECORDS
     chosen = scenario(**changes)
     agree(measure_virtual_run(chosen), measure_log(trilat_net.simulate(chosen)))
 
 
-def test_the_figures_are_what_their_definitions_say() -> None:
+def test_figures_follow_their_definitions() -> None:
     chosen = scenario(**{"expect.synchronised_rad": 0.3})
-    found, log = measure_virtual_run(chosen), trilat_net.simulate(chosen)
+    figures, log = measure_virtual_run(chosen), trilat_net.simulate(chosen)
     errors = {name: np.abs(log[name].e) for name in log.sites}
     end = log["m1"].t_s > log["m1"].t_s[-1] - 1.0
     poses = np.array([log[name].q[end] for name in log.sites])
-    assert found.simulated_s == 2.5
-    assert found.peak_error_rad == max(e.max() for e in errors.values())
-    assert found.end_error_rad == max(e[end].max() for e in errors.values())
-    assert found.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
-    assert found.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
-    apart = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
-    assert 0.0 < max(apart) < 2.4
-    assert found.synchronised_at_s == max(apart)
-    assert found.ages["m1->s"].mean_ms == found.ages["m1->s"].max_ms == 20.0
-    assert (found.late_samples, found.missing, found.end.diverged_at_s) == (0, 0, None)
+    assert figures.simulated_s == 2.5
+    assert figures.peak_error_rad == max(e.max() for e in errors.values())
+    assert figures.end_error_rad == max(e[end].max() for e in errors.values())
+    assert figures.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
+    assert figures.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
+    times_s = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
+    assert 0.0 < max(times_s) < 2.4
+    assert figures.synchronised_at_s == max(times_s)
+    assert figures.ages["m1->s"].mean_ms == figures.ages["m1->s"].max_ms == 20.0
+    assert (figures.late_samples, figures.missing, figures.end.diverged_at_s) == (0, 0, None)
 
 
-def test_what_never_came_together_has_no_time_of_it() -> None:
+def test_a_run_without_convergence_has_no_convergence_time() -> None:
     assert (
         measure_virtual_run(scenario(**{"expect.synchronised_rad": 1e-6})).synchronised_at_s
         is None
@@ -98,16 +100,16 @@ def test_what_never_came_together_has_no_time_of_it() -> None:
 
 
 def test_a_link_without_samples_has_no_age() -> None:
-    found = measure_virtual_run(scenario(links={"m1->s": {"delay_ms": 9000.0}}))
-    assert found.ages["m1->s"].mean_ms is found.ages["m1->s"].max_ms is None
-    assert found.ages["m2->s"].max_ms == 20.0
+    figures = measure_virtual_run(scenario(links={"m1->s": {"delay_ms": 9000.0}}))
+    assert figures.ages["m1->s"].mean_ms is figures.ages["m1->s"].max_ms is None
+    assert figures.ages["m2->s"].max_ms == 20.0
 
 
-def test_a_run_that_diverged_says_when() -> None:
-    found = measure_virtual_run(scenario(**{"limits.qd_limit_rad_s": 0.3}))
-    assert found.end.diverged_at_s is not None
-    assert found.simulated_s == pytest.approx(found.end.diverged_at_s, abs=0.01)
-    assert found.missing == 0
+def test_a_diverged_run_has_its_instant() -> None:
+    figures = measure_virtual_run(scenario(**{"limits.qd_limit_rad_s": 0.3}))
+    assert figures.end.diverged_at_s is not None
+    assert figures.simulated_s == pytest.approx(figures.end.diverged_at_s, abs=0.01)
+    assert figures.missing == 0
 
 
 def test_every_missing_record_of_a_log_is_counted() -> None:
@@ -132,7 +134,9 @@ HEARD = load_scenario("free", {**RATES, "expect.synchronised_rad": 1.0})
 
 
 def records(seed: int) -> RecordBatch:
-    """Four seconds at 100 Hz with peers at 100 and 50 Hz; the second is heard of from tick 20 on."""
+    """Four seconds at 100 Hz with peers at 100 and 50 Hz; samples of the second peer come from
+    tick 20 on.
+    """
     rng = np.random.default_rng(seed)
     k = np.arange(TALLIED)
     used = np.array([k - 5, np.where(k < 20, -1, k // 2 - rng.integers(2, 9, TALLIED))]).T
@@ -148,9 +152,7 @@ def tallied(rows: RecordBatch, cuts: list[int]) -> SiteStats:
 
 
 @given(seed=st.integers(0, 1000), cuts=st.lists(st.integers(0, TALLIED), max_size=12))
-def test_the_cut_into_blocks_changes_no_statistics_of_a_site(
-    seed: int, cuts: list[int]
-) -> None:
+def test_blocks_change_no_statistics_of_a_site(seed: int, cuts: list[int]) -> None:
     rows = records(seed)
     cut, whole = tallied(rows, cuts), tallied(rows, [])
     for figure in (
@@ -172,7 +174,7 @@ def test_the_cut_into_blocks_changes_no_statistics_of_a_site(
 
 
 @given(seed=st.integers(0, 1000))
-def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
+def test_site_statistics_count_all_records(seed: int) -> None:
     rows = records(seed)
     tally = tallied(rows, [37, 38, 290])
     error = np.abs(rows.e)
@@ -182,8 +184,8 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
     assert tally.rms_error_rad == pytest.approx(
         max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1))
     )
-    apart = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
-    assert tally.unsynchronised_ns == (apart[-1] if apart else -1)
+    times_ns = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
+    assert tally.unsynchronised_ns == (times_ns[-1] if times_ns else -1)
     assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
     ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
     assert tally.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
@@ -198,7 +200,7 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
         assert row.tolist() == np.concatenate(peaks).tolist()
 
 
-def test_what_it_keeps_does_not_grow_with_the_records() -> None:
+def test_memory_does_not_grow_with_the_records() -> None:
     tally, block = SiteStats(HEARD, "s"), records(1)
     for n in range(30):
         tally.add(block._replace(t_ns=block.t_ns + n * TALLIED * PERIOD_NS))
@@ -206,14 +208,14 @@ def test_what_it_keeps_does_not_grow_with_the_records() -> None:
     assert len(tally.end(tally.last_ns).t_ns) == 100
 
 
-def test_a_link_that_never_had_a_sample_has_no_age() -> None:
+def test_site_link_without_samples_has_no_age() -> None:
     rows = records(1)
     rows.used[:, 1] = -1
     assert tallied(rows, [])._age_records[1] == 0
     assert tallied(rows, []).link_ages[1].mean_ms is None
 
 
-def test_a_bucket_without_records_says_so() -> None:
+def test_a_bucket_without_records_is_marked() -> None:
     rows = records(1)
     keep = (rows.t_ns // BUCKET_NS) != 7
     tally = SiteStats(HEARD, "s")
@@ -255,22 +257,24 @@ def rows(seed: int) -> RecordBatch:
 
 def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
     scenario = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100})
-    made = WindowStats(ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s")
+    window_stats = WindowStats(
+        ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s"
+    )
     for first, last in pairwise([0, *sorted(cuts), RECORDS]):
         if first < last:
-            made.add(RecordBatch(*(column[first:last] for column in records)))
-    return made.compute_ranges()
+            window_stats.add(RecordBatch(*(column[first:last] for column in records)))
+    return window_stats.compute_ranges()
 
 
 @given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, RECORDS), max_size=8))
-def test_the_cut_into_blocks_has_no_influence(seed: int, cuts: list[int]) -> None:
+def test_blocks_have_no_influence(seed: int, cuts: list[int]) -> None:
     cut, whole = stretched(rows(seed), cuts), stretched(rows(seed), [])
     for key in QUANTITIES:
         assert cut[key] == pytest.approx(whole[key], rel=1e-12, abs=1e-12)
 
 
 @given(seed=st.integers(0, 100), outside=st.sampled_from([slice(0, 50), slice(150, RECORDS)]))
-def test_what_lies_outside_of_the_window_leaves_no_trace(seed: int, outside: slice) -> None:
+def test_records_outside_the_window_leave_no_trace(seed: int, outside: slice) -> None:
     records = rows(seed)
     bent = RecordBatch(*(column.copy() for column in records))
     for column in bent[1:6]:
@@ -281,13 +285,13 @@ def test_what_lies_outside_of_the_window_leaves_no_trace(seed: int, outside: sli
 @pytest.mark.parametrize(
     ("to_s", "known"), [(1.5, True), (2.0, True), (2.01, False), (5.0, False)]
 )
-def test_a_window_that_the_records_do_not_fill_tells_nothing(to_s: float, known: bool) -> None:
+def test_incomplete_windows_have_no_numbers(to_s: float, known: bool) -> None:
     assert bool(stretched(rows(1), [], to_s=to_s)) == known
 
 
-def test_quantities_of_a_window_are_what_their_definitions_say(log: Log) -> None:
-    """The wall's force is the one whose torque J' F stands in the records."""
-    (found,) = measure_log(log).windows
+def test_window_quantities_follow_their_definitions(log: Log) -> None:
+    """The wall's force is the force whose torque J' F stands in the records."""
+    (window,) = measure_log(log).windows
     site = log["s"]
     inside = (site.t_s >= 0.5) & (site.t_s < 1.5)
     force = np.zeros(len(site))
@@ -307,36 +311,36 @@ def test_quantities_of_a_window_are_what_their_definitions_say(log: Log) -> None
         "wall_hits": np.sum((force[1:] > 1e-9) & (force[:-1] <= 1e-9)),
     }
     assert wanted["wall_hits"] >= 1
-    assert {key: found[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
+    assert {key: window[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
     for joint, key in enumerate(("q1_rad", "q2_rad")):
-        assert found[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
+        assert window[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
 
 
-def test_a_run_and_its_log_have_the_same_windows(log: Log) -> None:
+def test_runs_and_their_logs_have_equal_windows(log: Log) -> None:
     (run,), (logged,) = measure_virtual_run(log.scenario).windows, measure_log(log).windows
     assert run.keys() == set(QUANTITIES)
     for key in QUANTITIES:
         assert run[key] == pytest.approx(logged[key], rel=1e-12)
 
 
-def test_a_window_of_all_sites_has_the_largest_of_them(log: Log) -> None:
+def test_a_window_of_all_sites_has_the_largest(log: Log) -> None:
     everywhere = {
         "from_s": 0.5,
         "to_s": 1.5,
         "error_peak_rad": [0.0, 1.0],
         "torque_peak_nm": [0.0, 1.0],
     }
-    (found,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
+    (window,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
     inside = {name: (log[name].t_s >= 0.5) & (log[name].t_s < 1.5) for name in log.sites}
-    assert found["error_peak_rad"].most == max(
+    assert window["error_peak_rad"].most == max(
         np.abs(log[n].e[k]).max() for n, k in inside.items()
     )
-    assert found["torque_peak_nm"].least == max(
+    assert window["torque_peak_nm"].least == max(
         np.abs(log[n].tau[k]).max() for n, k in inside.items()
     )
 
 
-def test_a_run_that_ended_before_measures_nothing() -> None:
+def test_a_run_that_ended_before_has_no_window() -> None:
     assert measure_virtual_run(windowed(**{"limits.qd_limit_rad_s": 0.05})).windows == ({},)
 
 
@@ -350,41 +354,46 @@ def test_a_run_that_ended_before_measures_nothing() -> None:
     ],
     ids=["plain", "random", "rates", "diverged"],
 )
-def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any]) -> None:
-    asked = scenario(**changes)
-    ticked: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
-    looped: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
+def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> None:
+    varied = scenario(**changes)
+    ticked: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
+    looped: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
     diverged_at_s, _ = run_in_batches(
-        asked, {name: taken.append for name, taken in ticked.items()}
+        varied, {name: taken.append for name, taken in ticked.items()}
     )
     assert (
         run_compiled_in_batches(
-            asked, {n: taken.append for n, taken in looped.items()}
+            varied, {n: taken.append for n, taken in looped.items()}
         ).diverged_s
         == diverged_at_s
     )
-    for name in asked.names:
+    for name in varied.names:
         one, other = join_batches(ticked[name]), join_batches(looped[name])
         for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
 
 
-def test_any_metric_may_be_expected_of_run_and_log() -> None:
-    """Equal to what `trilat compare` has of the whole run; what has no number does not hold, and says why."""
-    asked = {
+def test_any_metric_may_be_expected() -> None:
+    """The metric equals that of `trilat compare` on the whole run; a metric without number does
+    not hold, and the reason is given.
+    """
+    expectations = {
         "chatter_nm": [0.0, 1e-9],
         "rms_error_rad": [0.0, 10.0],
         "theta_error_last": [0.0, 1.0],
     }
-    scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": asked}})
+    scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": expectations}})
     log = trilat_net.simulate(scenario)
     compared = trilat_net.compare(log, log).metrics
     run, logged = measure_virtual_run(scenario), measure_log(log)
     assert run.metrics == logged.metrics
-    found = {one.key: one for one in evaluate_expectations(scenario.expect, run)}
-    assert [found[f"metrics.{key}"].held for key in asked] == [False, True, False]
-    assert found["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
-    assert "nothing is learnt" in found["metrics.theta_error_last"].measured
+    outcomes = {
+        expectation.key: expectation
+        for expectation in evaluate_expectations(scenario.expect, run)
+    }
+    assert [outcomes[f"metrics.{key}"].held for key in expectations] == [False, True, False]
+    assert outcomes["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
+    assert "nothing is learnt" in outcomes["metrics.theta_error_last"].measured
 
 
 @pytest.mark.parametrize(
@@ -401,8 +410,6 @@ def test_any_metric_may_be_expected_of_run_and_log() -> None:
         ({"chatter_nm": 1}, "expect.metrics"),
     ],
 )
-def test_an_expected_metric_that_cannot_be_is_refused(
-    metrics: dict[str, Any], said: str
-) -> None:
+def test_an_invalid_expected_metric_is_refused(metrics: dict[str, Any], said: str) -> None:
     with pytest.raises(ScenarioError, match=said):
         trilat_net.trials("free", set={"expect": {"metrics": metrics}})

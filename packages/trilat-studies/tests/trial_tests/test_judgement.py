@@ -1,4 +1,4 @@
-"""Expectations: both directions, every key, what no metric can meet; and `stable` against theory."""
+"""Expectations: both directions, every key, quantities without metric; and `stable` against theory."""
 
 from typing import Any
 
@@ -45,7 +45,7 @@ def only(expect: Expect, **changes: Any) -> ExpectationResult:
     return outcomes[0]
 
 
-def test_every_key_that_asks_is_answered_and_no_other() -> None:
+def test_every_asked_key_is_answered_and_no_other() -> None:
     tables = {"windows", "metrics"}
     assert READINGS.keys() | OTHERS.keys() | TOLERANCES | tables == set(
         Expect.__struct_fields__
@@ -57,7 +57,7 @@ def test_every_key_that_asks_is_answered_and_no_other() -> None:
 
 @pytest.mark.parametrize("key", READINGS)
 @given(limit=st.floats(1e-4, 1e4))
-def test_a_limit_holds_just_where_the_figure_is_within_it(key: str, limit: float) -> None:
+def test_a_limit_holds_exactly_within_the_figure(key: str, limit: float) -> None:
     if key == "late_samples_max":
         limit = int(limit)
     outcome = only(Expect(**{key: limit}))
@@ -81,13 +81,13 @@ def test_a_limit_itself_still_holds(key: str) -> None:
     ("key", "field"),
     [("synchronised_by_s", "synchronised_at_s"), ("end_spread_max_rad", "end_spread_rad")],
 )
-def test_what_was_not_measured_does_not_hold(key: str, field: str) -> None:
+def test_unmeasured_quantities_do_not_hold(key: str, field: str) -> None:
     outcome = only(Expect(**{key: 1e9}), **{field: None})
     assert not outcome.held
     assert outcome.measured == "never"
 
 
-def test_a_link_without_samples_meets_no_limit_of_age() -> None:
+def test_links_without_samples_meet_no_age_limit() -> None:
     ages = {**CALM.ages, "m1->m2": type(CALM.ages["m1->s"])(None, None)}
     for key in ("age_max_ms", "mean_age_max_ms"):
         assert not only(Expect(**{key: 1e9}), ages=ages).held
@@ -103,7 +103,7 @@ def test_a_link_without_samples_meets_no_limit_of_age() -> None:
         (EndBehaviour.BOUNDED, Stability.NOT_STABLE),
     ],
 )
-def test_stable_asks_for_the_judgement_and_open_is_neither(
+def test_stable_needs_the_judgement_and_open_fails(
     behaviour: EndBehaviour, stability: Stability, stable: bool
 ) -> None:
     end = CALM.end._replace(behaviour=behaviour)
@@ -117,7 +117,7 @@ def test_stable_asks_for_the_judgement_and_open_is_neither(
 
 
 @pytest.mark.parametrize("stable", [None, True, False])
-def test_a_run_that_diverged_fails_unless_that_was_expected(stable: bool | None) -> None:
+def test_diverged_runs_fail_unless_divergence_was_expected(stable: bool | None) -> None:
     end = CALM.end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=3.25)
     outcome = only(Expect(stable=stable), end=end)
     assert outcome.held == (stable is False)
@@ -125,7 +125,7 @@ def test_a_run_that_diverged_fails_unless_that_was_expected(stable: bool | None)
 
 
 @given(off=st.floats(-0.1, 0.1), within=st.floats(1e-3, 0.05))
-def test_a_pose_is_met_within_its_tolerance_in_every_joint(off: float, within: float) -> None:
+def test_pose_must_match_each_joint_within_tolerance(off: float, within: float) -> None:
     for wanted in ((0.1 + off, 0.2), (0.1, 0.2 - off)):
         outcome = only(Expect(end_pose_rad={"s": wanted}, end_pose_within_rad=within))
         assert outcome.margin is not None
@@ -134,7 +134,7 @@ def test_a_pose_is_met_within_its_tolerance_in_every_joint(off: float, within: f
             assert outcome.held == (abs(off) < within)
 
 
-def test_every_site_with_pose_has_outcome_of_its_own() -> None:
+def test_sites_with_poses_have_outcomes_of_their_own() -> None:
     outcomes = evaluate_expectations(
         Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}), CALM
     )
@@ -163,7 +163,7 @@ def window(**limits: Any) -> Expect:
 
 
 @given(least=st.floats(-1.0, 1.0), width=st.one_of(st.just(0.0), st.floats(1e-6, 1.0)))
-def test_a_windows_quantity_holds_wholly_between_its_limits(least: float, width: float) -> None:
+def test_window_quantities_must_hold_throughout(least: float, width: float) -> None:
     most = least + width
     for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
         outcome = only(window(**{key: (least, most)}), windows=(SPANS,))
@@ -174,16 +174,18 @@ def test_a_windows_quantity_holds_wholly_between_its_limits(least: float, width:
             assert outcome.held == (outcome.margin >= 0.0)
 
 
-def test_window_that_run_did_not_reach_does_not_hold() -> None:
+def test_an_unreached_window_does_not_hold() -> None:
     outcome = only(window(error_peak_rad=(0.0, 1e9)), windows=({},))
     assert (outcome.held, outcome.measured, outcome.limit) == (False, "never", "0 to 1e+09 rad")
 
 
 def test_a_window_names_units_and_all_sites() -> None:
-    asked = ExpectWindow(
+    expect_window = ExpectWindow(
         from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
     )
-    outcomes = evaluate_expectations(Expect(windows=(asked,)), figures(windows=(SPANS,)))
+    outcomes = evaluate_expectations(
+        Expect(windows=(expect_window,)), figures(windows=(SPANS,))
+    )
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
     assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]
 
@@ -204,8 +206,8 @@ s = { m = 1.0 }
 """
 
 
-def held(three: bool, d: float, stable: bool, **link: object) -> bool:
-    """Whether `stable` holds of 40 s of free motion at 200 Hz, links of 200 ms unless said."""
+def is_stable(three: bool, d: float, stable: bool, **link: object) -> bool:
+    """True if `stable` holds for 40 s of free motion at 200 Hz, over links of 200 ms unless given."""
     changes = {
         "rate_hz": 200,
         "duration_s": 40.0,
@@ -229,15 +231,15 @@ def held(three: bool, d: float, stable: bool, **link: object) -> bool:
 def test_the_verdict_changes_at_the_margin_of_theory(
     three: bool, below: float, above: float
 ) -> None:
-    assert held(three, below, stable=False)
-    assert not held(three, below, stable=True)
-    assert held(three, above, stable=True)
-    assert not held(three, above, stable=False)
+    assert is_stable(three, below, stable=False)
+    assert not is_stable(three, below, stable=True)
+    assert is_stable(three, above, stable=True)
+    assert not is_stable(three, above, stable=False)
 
 
 @pytest.mark.long
-def test_jitter_decays_where_constant_delay_grows_and_play_out_diverges() -> None:
+def test_jitter_decays_where_constant_delay_grows() -> None:
     jitter = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}
-    assert held(True, 0.6, stable=True, **jitter)
-    assert held(True, 0.6, stable=False, delay_ms=200.0)
-    assert held(True, 0.6, stable=False, **jitter, playout_ms=400.0)
+    assert is_stable(True, 0.6, stable=True, **jitter)
+    assert is_stable(True, 0.6, stable=False, delay_ms=200.0)
+    assert is_stable(True, 0.6, stable=False, **jitter, playout_ms=400.0)

@@ -1,4 +1,6 @@
-"""The table: the worst of the runs, no failed run without its command; JUnit XML as its readers know it."""
+"""The table: the worst of the runs, and every failed run with its command; JUnit XML as its
+readers expect.
+"""
 
 import xml.etree.ElementTree as Xml
 
@@ -21,7 +23,7 @@ def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
     )
 
 
-def test_row_shows_worst_of_its_runs_and_how_many_held() -> None:
+def test_row_shows_worst_run_and_passed_count() -> None:
     report = TrialReport(
         [result(n, outcome(m)) for n, m in enumerate((0.5, -0.2, 0.1, -0.1))], 4.0
     )
@@ -39,7 +41,7 @@ def test_row_shows_worst_of_its_runs_and_how_many_held() -> None:
     assert not report.held
 
 
-def test_what_failed_comes_before_the_smallest_margin() -> None:
+def test_failures_precede_the_smallest_margin() -> None:
     failed = ExpectationResult("stable", False, "grows", "true")
     (row,) = TrialReport(
         [result(1, ExpectationResult("stable", True, "decays", "true")), result(2, failed)], 1.0
@@ -47,7 +49,7 @@ def test_what_failed_comes_before_the_smallest_margin() -> None:
     assert row.worst is failed
 
 
-def test_every_failed_run_is_named_first_ones_with_commands() -> None:
+def test_failed_runs_are_named_first_with_commands() -> None:
     report = TrialReport(
         [result(n, outcome(-0.1)) for n in range(1, MAX_FAILURES_SHOWN + 4)], 1.0
     )
@@ -61,7 +63,7 @@ def test_every_failed_run_is_named_first_ones_with_commands() -> None:
     )
 
 
-def test_a_run_without_a_result_fails_and_says_why() -> None:
+def test_runs_without_result_fail_with_a_reason() -> None:
     report = TrialReport(
         [result(1, outcome(0.5)), result(2, error="its process ended with code -9")], 1.0
     )
@@ -73,14 +75,14 @@ def test_a_run_without_a_result_fails_and_says_why() -> None:
     assert "code -9" in report.summary()
 
 
-def test_what_held_is_told_without_failures() -> None:
+def test_passed_results_are_reported_without_failures() -> None:
     report = TrialReport([result(1, outcome(0.5)), result(2, outcome(0.25))], 4.0)
     assert report.held
     assert report.failures() == []
     assert report.remarks() == ["2 runs, 40 s simulated in 4.0 s: 10x"]
 
 
-def test_scenarios_of_one_name_are_told_apart() -> None:
+def test_scenarios_of_one_name_are_distinguished() -> None:
     report = TrialReport(
         [result(1, outcome(0.5), source=name) for name in ("a.toml", "b/a.toml")], 1.0
     )
@@ -141,7 +143,7 @@ def mixed() -> TrialReport:
     )
 
 
-def test_the_shape_is_the_one_that_readers_know() -> None:
+def test_junit_has_the_shape_its_readers_know() -> None:
     for element in document(mixed()).iter():
         attributes, children = ALLOWED[element.tag]
         assert set(element.keys()) <= attributes, element.tag
@@ -149,7 +151,7 @@ def test_the_shape_is_the_one_that_readers_know() -> None:
         assert element.tag not in ("testsuite", "testcase", "property") or element.get("name")
 
 
-def test_suite_per_scenario_case_per_run_and_counts_add_up() -> None:
+def test_junit_counts_suites_and_cases_correctly() -> None:
     root = document(mixed())
     suites = root.findall("testsuite")
     assert [suite.get("name") for suite in suites] == ["quick.toml", "b.toml"]
@@ -173,13 +175,13 @@ def test_a_failure_carries_the_figures_and_the_command() -> None:
     assert "lost" in str(error.get("message"))
 
 
-def test_properties_say_what_was_run() -> None:
+def test_properties_describe_the_run() -> None:
     suite = document(mixed()).find("testsuite")
     assert suite is not None
-    found = {p.get("name"): p.get("value") for p in suite.iter("property")}
-    assert found["driver"] == "virtual"
-    assert found["random"] == "true"
-    assert found["simulated_s"] == "60"
+    properties = {p.get("name"): p.get("value") for p in suite.iter("property")}
+    assert properties["driver"] == "virtual"
+    assert properties["random"] == "true"
+    assert properties["simulated_s"] == "60"
 
 
 @given(text=st.text())

@@ -1,4 +1,4 @@
-"""Many trials: the same results in the same order; the shipped scenarios, and the recipe for pytest."""
+"""Many trials: equal results in equal order; the shipped scenarios, and the recipe for pytest."""
 
 import os
 import subprocess
@@ -25,17 +25,17 @@ def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], 
 
 
 @pytest.mark.long
-def test_two_processes_give_results_of_one_in_same_order() -> None:
+def test_two_processes_give_equal_results_in_order() -> None:
     batch = trilat_net.trials(quick(), [5, 2, 9, 4])
-    told: list[TrialResult] = []
-    report = run_trials(batch, 2, told.append)
+    results: list[TrialResult] = []
+    report = run_trials(batch, 2, results.append)
     assert facts(report.results) == facts(run_trials(batch, 1).results)
-    assert sorted(facts(told)) == sorted(facts(report.results))
+    assert sorted(facts(results)) == sorted(facts(report.results))
     assert report.held
     assert report.wall_s > 0.0
 
 
-def test_check_returns_the_results_or_tells_all_that_failed(quick_file: Path) -> None:
+def test_check_returns_results_or_reports_all_failures(quick_file: Path) -> None:
     assert trilat_net.check(quick_file, [1, 2], jobs=1).held
     with pytest.raises(AssertionError) as failed:
         trilat_net.check(quick_file, [1, 2], TOO_MUCH, jobs=1)
@@ -56,15 +56,13 @@ print(len(trilat_net.check(sys.argv[1], seeds=[1, 2, 3], jobs=2).results), "held
 
 
 @pytest.mark.long
-def test_it_works_in_a_script_without_a_guarded_main_part(
-    quick_file: Path, tmp_path: Path
-) -> None:
+def test_trials_work_in_an_unguarded_script(quick_file: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    assert printed(script, quick_file, cwd=tmp_path) == "3 held\n"
+    assert run_script(script, quick_file, cwd=tmp_path) == "3 held\n"
 
 
-def printed(script: Path, *arguments: str | Path, cwd: Path) -> str:
+def run_script(script: Path, *arguments: str | Path, cwd: Path) -> str:
     done = subprocess.run(
         [sys.executable, str(script), *map(str, arguments)],
         cwd=cwd,
@@ -93,7 +91,7 @@ TICKS = {
         pytest.param(10**9, set(), 7, marks=pytest.mark.long),
     ],
 )
-def test_every_shipped_scenario_expects_something_and_it_holds(
+def test_all_shipped_scenarios_meet_their_expectations(
     most: int, left_out: set[str], least: int
 ) -> None:
     assert all(load_scenario(name).expect.has_expectations for name in TICKS)
@@ -110,10 +108,8 @@ RECIPE = textwrap.dedent(
 
 
 @pytest.mark.long
-def test_recipe_gives_test_per_seed_that_fails_with_figures(
-    quick_file: Path, tmp_path: Path
-) -> None:
-    """The same lines on a scenario that holds, and on one that does not."""
+def test_pytest_recipe_gives_one_test_per_seed(quick_file: Path, tmp_path: Path) -> None:
+    """The same lines are run on a scenario that holds, and on one that does not."""
     assert len(RECIPE.strip().splitlines()) <= 10
     for good in (True, False):
         source = tmp_path / f"scenario_{good}.toml"

@@ -1,6 +1,6 @@
-"""Which trials a scenario has, what one says when it fails, and the command that repeats it.
+"""The trials of a scenario, messages of failed trials, and the command that repeats a trial.
 
-A live trial, judged by its log: by the same expectations, and by what only a log shows.
+A live trial is judged by its log: by the same expectations, and by those that need a log.
 """
 
 import shlex
@@ -31,7 +31,7 @@ def test_a_random_scenario_has_a_trial_per_seed(quick_file: Path) -> None:
     assert len({trial.run().outcomes[-1].measured for trial in batch}) == 3
 
 
-def test_without_chance_or_network_one_run_tells_all() -> None:
+def test_without_chance_one_run_decides() -> None:
     constant = quick(**CONSTANT)
     assert [trial.scenario.seed for trial in trilat_net.trials(constant, range(4, 9))] == [4]
     assert len(trilat_net.trials(constant, range(4, 9), live=True)) == 5
@@ -43,7 +43,7 @@ def test_a_seed_out_of_range_is_refused(seed: int) -> None:
         trilat_net.trials(quick(), [seed])
 
 
-def test_scenario_that_expects_nothing_is_refused_with_what_to_add(quick_file: Path) -> None:
+def test_a_scenario_without_expectations_is_refused(quick_file: Path) -> None:
     quick_file.write_text(quick_file.read_text().partition("[expect]")[0])
     for source in (quick_file, load_scenario(quick_file)):
         with pytest.raises(ScenarioError, match=r"quick.*\[expect\].*stable = true"):
@@ -58,7 +58,7 @@ def test_an_expectation_of_an_unreached_time_is_refused() -> None:
         trilat_net.trials(quick(), set={"expect.windows": [window]})
 
 
-def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:
+def test_a_passed_trial_returns_what_held(quick_file: Path) -> None:
     result = trilat_net.trials(quick_file)[0].check()
     assert result.held
     assert result.simulated_s == 0.5
@@ -68,7 +68,7 @@ def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:
     ]
 
 
-def test_a_failed_trial_says_by_how_much(quick_file: Path) -> None:
+def test_a_failed_trial_names_its_excess(quick_file: Path) -> None:
     (trial,) = trilat_net.trials(quick_file, [7], TOO_MUCH)
     with pytest.raises(AssertionError) as failed:
         trial.check()
@@ -91,7 +91,7 @@ tables = st.dictionaries(
 
 
 @given(overrides=tables)
-def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) -> None:
+def test_the_command_line_has_the_same_overrides(overrides: dict[str, Any]) -> None:
     by_text: dict[str, Any] = {}
     by_value: dict[str, Any] = {}
     apply_overrides(by_text, shlex.split(shlex.join(list_assignments(overrides))))
@@ -99,7 +99,7 @@ def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) ->
     assert by_text == by_value
 
 
-def test_a_table_as_an_override_is_told_key_by_key() -> None:
+def test_a_table_override_is_shown_by_key() -> None:
     (trial,) = trilat_net.trials(quick(), set=CONSTANT)
     assert shlex.split(trial.again)[-4:] == [
         "--set",
@@ -109,7 +109,7 @@ def test_a_table_as_an_override_is_told_key_by_key() -> None:
     ]
 
 
-def test_a_scenario_in_memory_is_called_by_a_file_name() -> None:
+def test_an_unsaved_scenario_is_named_by_file() -> None:
     assert trilat_net.trials(quick())[0].again == "trilat test ./quick.toml --seeds 1"
 
 
@@ -118,22 +118,20 @@ LIMITS = {"expect": {"peak_error_max_rad": 2.0, "no_gaps": True}}
 
 @pytest.fixture
 def trial() -> Trial:
-    (made,) = trilat_net.trials(
+    (trial_made,) = trilat_net.trials(
         load_scenario("free", {"duration_s": 0.12, "link.delay_ms": 20.0, **LIMITS}), live=True
     )
-    return made
+    return trial_made
 
 
-def written(folder: Path, data: bytes) -> Path:
+def write_log(folder: Path, data: bytes) -> Path:
     path = folder / "run.mcap"
     path.write_bytes(data)
     return path
 
 
-def test_session_that_ended_in_order_is_judged_by_its_records(
-    trial: Trial, tmp_path: Path
-) -> None:
-    log = written(tmp_path, recorded("free"))
+def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
+    log = write_log(tmp_path, recorded("free"))
     result = evaluate_live_log(trial, log, [], 1.0)
     assert result.held
     assert [o.key for o in result.outcomes] == [
@@ -146,23 +144,23 @@ def test_session_that_ended_in_order_is_judged_by_its_records(
     assert result.simulated_s == pytest.approx(0.12)
 
 
-def test_a_problem_of_the_session_fails_it(trial: Trial, tmp_path: Path) -> None:
+def test_a_session_problem_fails_the_trial(trial: Trial, tmp_path: Path) -> None:
     result = evaluate_live_log(
-        trial, written(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
+        trial, write_log(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
     )
     assert [o.key for o in result.outcomes if not o.held] == ["session"]
     assert "SIGKILL" in result.failures[0]
 
 
-def test_missing_records_fail_it(trial: Trial, tmp_path: Path) -> None:
-    log = written(tmp_path, edited(recorded("free"), record=without("s", {50})))
+def test_missing_records_fail_the_trial(trial: Trial, tmp_path: Path) -> None:
+    log = write_log(tmp_path, edited(recorded("free"), record=without("s", {50})))
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
         "no_gaps",
         "executed again",
     ]
 
 
-def test_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_path: Path) -> None:
+def test_a_record_that_contradicts_its_inputs_fails(trial: Trial, tmp_path: Path) -> None:
     def bent(record: dict) -> dict:  # type: ignore[type-arg]
         return (
             {**record, "tau": [0.0, 1.0]}
@@ -170,21 +168,21 @@ def test_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_path
             else record
         )
 
-    log = written(tmp_path, edited(recorded("free"), record=bent))
+    log = write_log(tmp_path, edited(recorded("free"), record=bent))
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
         "executed again"
     ]
 
 
 @pytest.mark.parametrize("content", [None, b"no log", "empty"])
-def test_without_records_there_is_no_result_and_reason_is_told(
+def test_without_records_there_is_only_a_reason(
     content: bytes | str | None, trial: Trial, tmp_path: Path
 ) -> None:
     log = tmp_path / "run.mcap"
     if content == "empty":
-        written(tmp_path, edited(recorded("free"), record=lambda _: None))
+        write_log(tmp_path, edited(recorded("free"), record=lambda _: None))
     elif isinstance(content, bytes):
-        written(tmp_path, content)
+        write_log(tmp_path, content)
     result = evaluate_live_log(trial, log, ["m1 ended with code 2"], 1.0)
     assert not result.held
     assert "m1 ended with code 2" in result.error

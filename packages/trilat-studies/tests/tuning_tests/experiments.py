@@ -35,13 +35,15 @@ def trio(*overrides: str) -> Scenario:
     return parse_scenario(TRIO, overrides=overrides)
 
 
-def asked(folder: Path, *overrides: str, text: str = TRIO, **settings: object) -> TuningPlan:
-    """A comparison in that scenario, as a file."""
+def plan_quick_tuning(
+    folder: Path, *overrides: str, text: str = TRIO, **settings: object
+) -> TuningPlan:
+    """Returns a request for a comparison in the quick scenario, as a file."""
     path = folder / "trio.toml"
     path.write_text(text)
     return plan_tuning(path, overrides, **settings)  # type: ignore[arg-type]
 
 
 def dominates(a: ObjectivePoint, b: ObjectivePoint) -> bool:
-    """True where a is no worse than b in both, and better in one."""
+    """True if a is no worse than b in both objectives, and better in one."""
     return a[0] <= b[0] and a[1] <= b[1] and a != b

@@ -1,12 +1,11 @@
-"""How many modes of alike arms grow, counted by the argument principle from M(q), K and d alone.
+"""The number of growing modes of alike arms, counted by the argument principle from M(q), K and
+d alone.
 
-Two alike arms that follow one another split into a sum and a difference: each is one arm that its own
-position reaches n ticks later, with a = 1 or -1,
-
-    x[k + 1] = P x[k] + a Q S x[k - n],    det(1 - a z^-n S (z - P)^-1 Q)
-
-whose turns about zero along a circle just outside of abs(z) = 1 count what grows. Desoer and Wang, "On the
-generalized Nyquist stability criterion", IEEE Trans. Automatic Control 25 (1980). Nothing of `trilat_net`.
+Two alike arms that follow one another split into a sum and a difference. Each is one arm that
+receives its own position n ticks later, with a = 1 or -1: x[k + 1] = P x[k] + a Q S x[k - n].
+The turns of det(1 - a z^-n S (z - P)^-1 Q) about zero along a circle just outside of abs(z) = 1
+count the growing modes. Desoer and Wang, "On the generalized Nyquist stability criterion", IEEE
+Trans. Automatic Control 25 (1980). Nothing is imported from `trilat_net`.
 """
 
 import numpy as np
@@ -19,7 +18,9 @@ _GROWTH = 1e-7
 
 
 def count_growing(M: Array, K: Array, d: Array, delay_ticks: int, h_s: float) -> int:
-    """The modes that grow under P+d without gravity, whose torque is 1.5 tau_k - 0.5 tau_{k-1}."""
+    """Returns the number of growing modes under P+d without gravity, with torque 1.5 tau_k -
+    0.5 tau_{k-1}.
+    """
     n = len(M)
     zero, one = np.zeros((n, n)), np.eye(n)
     held = np.block([[zero, one, zero], [zero, zero, np.linalg.inv(M)], [np.zeros((n, 3 * n))]])
@@ -38,14 +39,14 @@ def count_growing(M: Array, K: Array, d: Array, delay_ticks: int, h_s: float) ->
         return np.linalg.det(one - np.array([1.0, -1.0]).reshape(2, 1, 1) * G[:, np.newaxis])
 
     angle = np.geomspace(1e-3 * _GROWTH, np.pi, 500)
-    found = values(angle)
+    determinants = values(angle)
     while True:
-        turns = np.angle(found[1:] / found[:-1])
+        turns = np.angle(determinants[1:] / determinants[:-1])
         wide = np.flatnonzero(np.abs(turns).max(axis=1) > 0.8)
         if not len(wide):
             break
         between = np.sqrt(angle[wide] * angle[wide + 1])
-        found = np.insert(found, wide + 1, values(between), axis=0)
+        determinants = np.insert(determinants, wide + 1, values(between), axis=0)
         angle = np.insert(angle, wide + 1, between)
     alone = int((np.abs(np.linalg.eigvals(P)) > 1.0 + _GROWTH).sum())
     return 2 * alone - round(float(turns.sum()) / np.pi)

@@ -1,11 +1,11 @@
-"""Arms of one's own as texts of URDF, for gains that an arm bears."""
+"""Users' own arms as URDF texts, for the gains that an arm tolerates."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 
 class Piece(NamedTuple):
-    """A joint and the link that it moves: a rod along x, of mass kg and length m."""
+    """A joint and the link that the joint moves: a rod along x, of mass kg and length m."""
 
     axis: str = "0 0 1"
     mass: float = 1.0
@@ -16,7 +16,7 @@ class Piece(NamedTuple):
 
 
 def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
-    """The text of a chain; `payload` is the text of a body at its end."""
+    """Returns the URDF of a chain; `payload` is the text of a body at its end."""
     parts = ['<robot name="odd"><link name="base"/>']
     before, end = "base", "0 0 0"
     for n, one in enumerate(pieces, 1):
@@ -40,11 +40,11 @@ def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
 
 
 def body(mass: float, place: str) -> str:
-    """The text of a ball of 5 cm."""
-    own = 0.4 * mass * 0.05**2
+    """Returns the text of a ball of 5 cm."""
+    inertia = 0.4 * mass * 0.05**2
     return (
-        f'<inertial><origin xyz="{place}"/><mass value="{mass}"/><inertia ixx="{own}" ixy="0" ixz="0" '
-        f'iyy="{own}" iyz="0" izz="{own}"/></inertial>'
+        f'<inertial><origin xyz="{place}"/><mass value="{mass}"/><inertia ixx="{inertia}" ixy="0" ixz="0" '
+        f'iyy="{inertia}" iyz="0" izz="{inertia}"/></inertial>'
     )
 
 

@@ -1,4 +1,4 @@
-"""The largest gains that an arm bears: the edge by roots, the margins, and runs that confirm both."""
+"""The largest gains that an arm tolerates: the edge by roots, the margins, and runs that confirm both."""
 
 import json
 import math
@@ -37,7 +37,9 @@ DELAYS = ("0", "20ms", "100ms", "jitter")
 def write_jitter(
     path: Path, swing_ms: float = 15.0, jitter_ms: float = 3.0, every_s: float = 0.01
 ) -> Path:
-    """A trace of 2 s about 40 ms: a queue that fills and empties, and what is drawn anew in intervals."""
+    """Writes a trace of 2 s about 40 ms: a queue that fills and empties, and delays drawn anew
+    in intervals.
+    """
     chance = random.Random(3)
     rows = []
     for n in range(round(2.0 / every_s)):
@@ -52,7 +54,7 @@ def write_jitter(
 
 
 def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
-    """The gains of an arm of one's own, of a shipped one, or of a maker's."""
+    """Returns the gains of a user's own arm, of a shipped arm, or of a maker's arm."""
     arm, tip = Path(name), ""
     if name in ODD_ARMS:
         arm = folder / "odd.urdf"
@@ -65,67 +67,67 @@ def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
     return tune_arm(arm, known, tip=tip, **more)  # type: ignore[arg-type]
 
 
-def assert_confirmed(found: ArmGains) -> None:
-    """Below the edge the runs decay, beyond it they grow, and at the gains they decay."""
-    stable = {run["share"]: run["stable"] for run in found.runs}
-    assert stable == {None: True, SHARES[0]: True, SHARES[1]: False}, found.summary()
-    assert found.agree
+def assert_confirmed(arm_gains: ArmGains) -> None:
+    """Asserts that runs decay below the edge, grow beyond the edge, and decay at the chosen gains."""
+    stable = {run["share"]: run["stable"] for run in arm_gains.runs}
+    assert stable == {None: True, SHARES[0]: True, SHARES[1]: False}, arm_gains.summary()
+    assert arm_gains.agree
 
 
-def assert_proven(found: ArmGains) -> None:
-    """At a margin of 2 P+d meets d > K T, which suffices whatever the masses."""
-    assert (gains(found, "d") > gains(found, "K") * 1e-3 * found.age_ms).all()
+def assert_proven(arm_gains: ArmGains) -> None:
+    """Asserts that, at a margin of 2, P+d meets d > K T, which suffices whatever the masses."""
+    assert (gains(arm_gains, "d") > gains(arm_gains, "K") * 1e-3 * arm_gains.age_ms).all()
 
 
 @pytest.mark.parametrize("delay", ["0", "20ms"])
 @pytest.mark.parametrize("name", ["one joint", "slide"])
 def test_runs_confirm_the_edge(name: str, delay: str, tmp_path: Path) -> None:
-    found = tune(name, delay, tmp_path, poses=2)
-    assert_confirmed(found)
-    assert_proven(found)
+    tuning = tune(name, delay, tmp_path, poses=2)
+    assert_confirmed(tuning)
+    assert_proven(tuning)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("name", ARMS)
 def test_runs_confirm_the_edge_of_every_arm(name: str, delay: str, tmp_path: Path) -> None:
-    found = tune(name, delay, tmp_path)
-    assert_confirmed(found)
-    assert_proven(found)
+    tuning = tune(name, delay, tmp_path)
+    assert_confirmed(tuning)
+    assert_proven(tuning)
 
 
-def gains(found: ArmGains, name: str) -> np.ndarray:
-    """One gain of every joint."""
-    return np.array([joint[name] for joint in found.joints])
+def gains(arm_gains: ArmGains, name: str) -> np.ndarray:
+    """Returns the same gain for every joint."""
+    return np.array([joint[name] for joint in arm_gains.joints])
 
 
 @pytest.fixture
 def one_joint(tmp_path: Path) -> Path:
-    """An arm of one joint."""
+    """Returns an arm of one joint."""
     path = tmp_path / "one.urdf"
     path.write_text(write_arm([SHOULDER]), encoding="utf-8")
     return path
 
 
-def test_the_edge_of_one_joint_is_that_of_its_equation(one_joint: Path) -> None:
+def test_one_joint_has_the_edge_of_its_equation(one_joint: Path) -> None:
     """M w^2 = K (1 + cos w T) and d w = K sin w T, with d = 2 zeta sqrt(K M)."""
-    found = tune_arm(one_joint, "60ms", poses=1, margin=2.0, damping=0.7)
+    tuned_arm = tune_arm(one_joint, "60ms", poses=1, margin=2.0, damping=0.7)
     zeta = 0.7 / math.sqrt(2.0)
     w = math.sqrt(2.0 - 4.0 * zeta**2)
     k = (math.acos(w * w - 1.0) / w / 0.06) ** 2
-    assert found.edge["continuous_per_s2"] == pytest.approx(k, rel=1e-3)
-    assert found.edge["k_per_s2"] == pytest.approx(k, rel=1e-2)
+    assert tuned_arm.edge["continuous_per_s2"] == pytest.approx(k, rel=1e-3)
+    assert tuned_arm.edge["k_per_s2"] == pytest.approx(k, rel=1e-2)
     M = 3.0 * 0.5**2 / 3.0
-    assert gains(found, "inertia") == pytest.approx([M], rel=1e-6)
-    assert gains(found, "K") == pytest.approx([k * M / 2.0], rel=1e-2)
-    assert gains(found, "d") == pytest.approx(
-        2.0 * 0.7 * np.sqrt(gains(found, "K") * M), rel=2e-3
+    assert gains(tuned_arm, "inertia") == pytest.approx([M], rel=1e-6)
+    assert gains(tuned_arm, "K") == pytest.approx([k * M / 2.0], rel=1e-2)
+    assert gains(tuned_arm, "d") == pytest.approx(
+        2.0 * 0.7 * np.sqrt(gains(tuned_arm, "K") * M), rel=2e-3
     )
 
 
 @pytest.mark.parametrize("name", ["slide", pytest.param("arm6.urdf", marks=pytest.mark.long)])
-def test_modes_begin_to_grow_where_the_edge_is(name: str, tmp_path: Path) -> None:
-    found = tune(name, "20ms", tmp_path, poses=3, set={"arm.g_m_s2": 0})
+def test_modes_begin_to_grow_at_the_edge(name: str, tmp_path: Path) -> None:
+    tuning = tune(name, "20ms", tmp_path, poses=3, set={"arm.g_m_s2": 0})
     arm = str(tmp_path / "odd.urdf") if name in ODD_ARMS else name
     loop = {
         "name": "loop",
@@ -136,16 +138,16 @@ def test_modes_begin_to_grow_where_the_edge_is(name: str, tmp_path: Path) -> Non
         "link": {"delay_ms": 20.0},
         "control": {"law": "p_d", "K": 1e-6, "d": 1e-6},
     }
-    M = tn.load_scenario(loop).arms["m"].inertia(np.array(found.edge["pose"]))
+    M = tn.load_scenario(loop).arms["m"].inertia(np.array(tuning.edge["pose"]))
     for share, grows in ((0.99, False), (1.01, True)):
-        k = share * found.edge["k_per_s2"]
-        m, zeta = gains(found, "inertia"), 0.7 / math.sqrt(2.0)
+        k = share * tuning.edge["k_per_s2"]
+        m, zeta = gains(tuning, "inertia"), 0.7 / math.sqrt(2.0)
         assert (count_growing(M, k * m, 2.0 * zeta * math.sqrt(k) * m, 20, 1e-3) > 0) is grows
 
 
 @cache
 def tune_shoulder(share: float) -> ArmGains:
-    """The gains of an arm of one joint with so much of its mass."""
+    """Returns the gains of an arm of one joint with the given mass."""
     text = write_arm([SHOULDER._replace(mass=share * SHOULDER.mass)])
     return tune_arm("arm", "30ms", poses=1, set={"urdf": {"arm": text}})
 
@@ -153,9 +155,9 @@ def tune_shoulder(share: float) -> ArmGains:
 @settings(max_examples=3)
 @given(st.floats(0.05, 20.0))
 def test_gains_scale_with_all_masses(c: float) -> None:
-    found = [tune_shoulder(1.0), tune_shoulder(c)]
+    arms = [tune_shoulder(1.0), tune_shoulder(c)]
     for name in ("K", "d"):
-        assert gains(found[1], name) == pytest.approx(c * gains(found[0], name), rel=5e-3)
+        assert gains(arms[1], name) == pytest.approx(c * gains(arms[0], name), rel=5e-3)
 
 
 def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
@@ -163,7 +165,7 @@ def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
     assert k[0] > 3.0 * k[1] > 9.0 * k[2]
 
 
-def test_beyond_some_rate_the_delay_alone_counts(one_joint: Path) -> None:
+def test_at_high_rates_only_delay_limits_gains(one_joint: Path) -> None:
     slow, fast, faster = (
         tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000)
     )
@@ -186,12 +188,14 @@ def test_with_enough_damping_no_delay_bounds_the_stiffness(one_joint: Path) -> N
 
 @pytest.mark.parametrize("margin", [1.5, pytest.param(4.0, marks=pytest.mark.long)])
 def test_damping_keeps_the_margin_to_its_limit(margin: float, tmp_path: Path) -> None:
-    found = tune("slide", "1ms", tmp_path, poses=1, margin=margin)
-    assert found.edge["used_per_s2"] <= found.edge["limit_per_s2"] / margin**2 * (1.0 + 1e-9)
-    assert found.edge["used_per_s2"] <= found.edge["k_per_s2"]
-    m = gains(found, "inertia")
-    assert gains(found, "K") == pytest.approx(found.edge["used_per_s2"] * m / margin, rel=1e-3)
-    assert found.runs[0]["stable"]
+    tuning = tune("slide", "1ms", tmp_path, poses=1, margin=margin)
+    assert tuning.edge["used_per_s2"] <= tuning.edge["limit_per_s2"] / margin**2 * (1.0 + 1e-9)
+    assert tuning.edge["used_per_s2"] <= tuning.edge["k_per_s2"]
+    m = gains(tuning, "inertia")
+    assert gains(tuning, "K") == pytest.approx(
+        tuning.edge["used_per_s2"] * m / margin, rel=1e-3
+    )
+    assert tuning.runs[0]["stable"]
 
 
 @pytest.mark.long
@@ -205,34 +209,37 @@ def test_the_longest_delays_lower_the_gains(one_joint: Path, tmp_path: Path) -> 
 
 @pytest.mark.long
 def test_over_slow_jitter_growth_begins_more_than_once(one_joint: Path, tmp_path: Path) -> None:
-    """Delays that change every 50 ms swing the loop as a child does: it grows below the edge too.
+    """Delays that change every 50 ms pump the loop parametrically: the loop grows below the
+    edge too.
 
     The gains are those of the constant delay, which is the tighter bound, and they are stable.
     """
-    found = tune_arm(one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1)
-    assert found.agree
-    assert [run["stable"] for run in found.runs] == [True, False, False]
+    tuned_arm = tune_arm(
+        one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1
+    )
+    assert tuned_arm.agree
+    assert [run["stable"] for run in tuned_arm.runs] == [True, False, False]
     assert (
-        found.edge["used_per_s2"]
-        == found.edge["constant_per_s2"]
-        < 0.5 * found.edge["k_per_s2"]
+        tuned_arm.edge["used_per_s2"]
+        == tuned_arm.edge["constant_per_s2"]
+        < 0.5 * tuned_arm.edge["k_per_s2"]
     )
 
 
 def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
-    found = tune_arm(one_joint, f"measured:{GOLDEN / 'live-4g.mcap'}", poses=1)
-    assert re.fullmatch(r"the delays of \w+->\w+ in live-4g.mcap", found.delay)
-    assert found.runs[0]["stable"]
+    tuned_arm = tune_arm(one_joint, f"measured:{GOLDEN / 'live-4g.mcap'}", poses=1)
+    assert re.fullmatch(r"the delays of \w+->\w+ in live-4g.mcap", tuned_arm.delay)
+    assert tuned_arm.runs[0]["stable"]
 
 
-def test_a_session_has_the_delay_of_its_slowest_link(
+def test_sessions_have_the_delay_of_their_slowest_link(
     one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
     monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
-    words = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
-    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
-    assert told["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
+    arguments = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
+    facts = json.loads(trilat(*arguments, cwd=tmp_path).succeeds())
+    assert facts["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
 
 
 @pytest.mark.long
@@ -243,17 +250,17 @@ def test_laws_with_stiffness_are_tuned_at_three_sites(law: str, tmp_path: Path) 
 
 @pytest.mark.long
 def test_gains_of_several_joints_scale_with_all_masses() -> None:
-    heavy = [one._replace(mass=7.0 * one.mass) for one in (SHOULDER, ELBOW)]
+    heavy = [piece._replace(mass=7.0 * piece.mass) for piece in (SHOULDER, ELBOW)]
     texts = [write_arm(arm) for arm in ([SHOULDER, ELBOW], heavy)]
-    found = [tune_arm("arm", "30ms", set={"urdf": {"arm": text}}) for text in texts]
+    arms = [tune_arm("arm", "30ms", set={"urdf": {"arm": text}}) for text in texts]
     for name in ("K", "d"):
-        assert gains(found[1], name) == pytest.approx(7.0 * gains(found[0], name), rel=5e-3)
+        assert gains(arms[1], name) == pytest.approx(7.0 * gains(arms[0], name), rel=5e-3)
 
 
-def test_a_digital_controller_bears_less(one_joint: Path) -> None:
-    held = tune_arm(one_joint, "5ms", poses=1, set={"scheme": "digital"})
-    assert_confirmed(held)
-    assert held.edge["k_per_s2"] < tune_arm(one_joint, "5ms", poses=1).edge["k_per_s2"]
+def test_a_digital_controller_tolerates_less_gain(one_joint: Path) -> None:
+    tuned_arm = tune_arm(one_joint, "5ms", poses=1, set={"scheme": "digital"})
+    assert_confirmed(tuned_arm)
+    assert tuned_arm.edge["k_per_s2"] < tune_arm(one_joint, "5ms", poses=1).edge["k_per_s2"]
 
 
 SCENARIO = """name = "mine"
@@ -266,21 +273,21 @@ dominance = {{ m = {{ s = 1.0 }}, s = {{ m = 1.0 }} }}
 """
 
 
-def test_the_line_is_one_of_a_scenario(one_joint: Path, tmp_path: Path) -> None:
-    words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
-    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
-    (tmp_path / "mine.toml").write_text(SCENARIO.format(line=told["line"]), encoding="utf-8")
+def test_the_printed_line_fits_a_scenario(one_joint: Path, tmp_path: Path) -> None:
+    arguments = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
+    facts = json.loads(trilat(*arguments, cwd=tmp_path).succeeds())
+    (tmp_path / "mine.toml").write_text(SCENARIO.format(line=facts["line"]), encoding="utf-8")
     control = tn.load_scenario(tmp_path / "mine.toml").sites["m"].control
-    assert list(control.K) == [joint["K"] for joint in told["joints"]]
-    assert told["agree"] is True
+    assert list(control.K) == [joint["K"] for joint in facts["joints"]]
+    assert facts["agree"] is True
 
 
 def test_the_command_draws_and_prints(one_joint: Path, tmp_path: Path) -> None:
-    words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--figure", "gains.png")
-    printed = trilat(*words, cwd=tmp_path).succeeds()
-    assert "effort limit" in printed
-    assert re.search(r"ok +run of .* at 0.95 of the edge: decays", printed)
-    assert re.search(r"ok +run of .* at 1.1 of the edge: grows", printed)
+    arguments = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--figure", "gains.png")
+    output = trilat(*arguments, cwd=tmp_path).succeeds()
+    assert "effort limit" in output
+    assert re.search(r"ok +run of .* at 0.95 of the edge: decays", output)
+    assert re.search(r"ok +run of .* at 1.1 of the edge: grows", output)
     assert (tmp_path / "gains.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -307,15 +314,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_is_refused_with_what_is_right(
+def test_bad_input_is_refused_with_the_valid_choices(
     kind: str, one_joint: Path, tmp_path: Path
 ) -> None:
     more, fact = REFUSED[kind]
     (tmp_path / "empty.csv").write_text("t_s,delay_ms\n", encoding="utf-8")
-    words = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
-    trilat("tune", *(word for pair in words.items() for word in pair), cwd=tmp_path).refuses(
-        fact
-    )
+    arguments = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
+    trilat(
+        "tune", *(word for pair in arguments.items() for word in pair), cwd=tmp_path
+    ).refuses(fact)
 
 
 def test_python_names_its_arguments(one_joint: Path) -> None:

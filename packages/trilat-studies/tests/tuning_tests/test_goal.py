@@ -1,6 +1,6 @@
-"""q*, against the linear systems whose rest it is said to be.
+"""The goal q* against the rest of linear systems.
 
-A score against the plain sums over a trajectory, and against what must be zero.
+A score against the plain sums over a trajectory, and against cases that must score zero.
 """
 
 import numpy as np
@@ -45,9 +45,7 @@ def at_end(scenario: Scenario) -> np.ndarray:
 
 
 @given(a=st.floats(0.05, 0.95), b=st.floats(0.05, 0.95), c=st.floats(0.05, 0.95))
-def test_without_hands_it_is_where_linear_consensus_comes_to(
-    a: float, b: float, c: float
-) -> None:
+def test_without_hands_the_goal_is_linear_consensus(a: float, b: float, c: float) -> None:
     """X' = (alpha - I) x, by the matrix exponential."""
     rows = [
         f"dominance={{m1 = {{m2 = {a!r}, s = {1 - a!r}}}, m2 = {{m1 = {b!r}, s = {1 - b!r}}}, "
@@ -62,8 +60,8 @@ def test_without_hands_it_is_where_linear_consensus_comes_to(
 
 @settings(max_examples=20)
 @given(K1=st.floats(1.0, 300.0), K2=st.floats(1.0, 300.0), x=st.floats(-1.0, 1.0))
-def test_hands_take_it_where_stiff_arms_rest(K1: float, K2: float, x: float) -> None:
-    """K_i (x_i - q_i) = k (q_i - sum_j alpha_ij q_j) with k far above K, solved as it stands."""
+def test_hands_put_the_goal_where_stiff_arms_rest(K1: float, K2: float, x: float) -> None:
+    """K_i (x_i - q_i) = k (q_i - sum_j alpha_ij q_j) with k far above K, solved directly."""
     # alike enough to be no conflict
     scenario = trio(hand("m1", (x, 0.0), (K1, K1)), hand("m2", (x + 0.01, 0.0), (K2, K2)))
     K = np.diag([K1, K2, 0.0])
@@ -72,7 +70,7 @@ def test_hands_take_it_where_stiff_arms_rest(K1: float, K2: float, x: float) -> 
     assert at_end(scenario)[0] == pytest.approx(rest.mean(), abs=1e-4)
 
 
-def test_a_joint_that_nobody_holds_stays() -> None:
+def test_a_joint_without_hand_stays() -> None:
     scenario = trio(hand("m1", (0.5, 0.7), (100.0, 0.0), start=0.5, end=1.0))
     before, held, after = compute_consensus_pose(scenario, np.array([0.2, 0.7, 1.9]))
     free = compute_consensus_pose(trio(), np.array([0.0]))[0]
@@ -81,7 +79,7 @@ def test_a_joint_that_nobody_holds_stays() -> None:
     assert after == pytest.approx([0.5, free[1]])
 
 
-def test_a_hand_moves_it_along_a_minimum_jerk_path() -> None:
+def test_hands_move_goals_along_minimum_jerk_paths() -> None:
     """Half way in the middle; the spring's target in `box`-like moves is checked in the core."""
     scenario = trio(
         'sites.m1.hands=[{kind = "spring", from_rad = [0.0, 0.0], to_rad = [1.0, 2.0], '
@@ -95,7 +93,7 @@ def test_a_hand_moves_it_along_a_minimum_jerk_path() -> None:
     assert path[:, 1] == pytest.approx(2.0 * path[:, 0])
 
 
-def test_twin_has_no_torque_without_target_and_no_wall() -> None:
+def test_twins_have_no_torque_and_no_wall() -> None:
     assert build_twin(trio()) is None
     assert build_twin(trio(hand("m1", (0.3, -0.2), (9.0, 9.0)))) is None
     for setting in (PULSE, WALL):
@@ -104,7 +102,7 @@ def test_twin_has_no_torque_without_target_and_no_wall() -> None:
         assert alone.sites == trio().sites
 
 
-def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
+def test_contradicting_hands_are_refused_with_their_site() -> None:
     with pytest.raises(
         ScenarioError,
         match=r"training: sites\.m1\.hands: at 0 s .* keep only one of the operators",
@@ -165,9 +163,9 @@ def scored(scenario: Scenario, alone: Scenario | None = None) -> CandidateScore:
     return measure_candidate(scenario.text, None if alone is None else alone.text)
 
 
-def test_error_and_effort_are_the_sums_that_the_docs_print() -> None:
+def test_error_and_effort_are_the_documented_sums() -> None:
     scenario = trio(*FIRM)
-    found = scored(scenario)
+    score = scored(scenario)
     run = trajectories(scenario)
     q, tau = run.stack("q"), run.stack("tau")
     # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
@@ -180,29 +178,29 @@ def test_error_and_effort_are_the_sums_that_the_docs_print() -> None:
     pose = beta @ q[:, 0] / beta.sum()
     inner, outer = 2.0 * 9.81 * np.cos(q[..., 0]), 9.81 * np.cos(q[..., 0] + q[..., 1])
     gravity = np.stack([inner + outer, outer], axis=-1)
-    assert found.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
-    assert found.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
-    assert found.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
-    assert found.pose_rad == pytest.approx(
+    assert score.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
+    assert score.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
+    assert score.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
+    assert score.pose_rad == pytest.approx(
         np.sqrt(np.mean((q.mean(axis=0) - pose) ** 2)), rel=1e-9
     )
     e = np.abs(q - run.stack("q_des")).max(axis=(0, 2))
-    assert found.settled_s == pytest.approx(0.01 * np.flatnonzero(e >= 0.01)[-1])
+    assert score.settled_s == pytest.approx(0.01 * np.flatnonzero(e >= 0.01)[-1])
 
 
-def test_arms_that_start_together_and_know_gravity_do_nothing() -> None:
+def test_arms_that_start_at_the_goal_do_nothing() -> None:
     still = trio(
         "control.law=p_d", *(f"sites.{name}.q0_rad=[0.2, 0.3]" for name in ("m1", "m2", "s"))
     )
-    found = scored(still)
-    assert found.outcome is CandidateClass.SETTLED
-    assert found.error_rad == pytest.approx(0.0, abs=1e-12)
-    assert found.effort_nm == pytest.approx(0.0, abs=1e-12)
-    assert found.settled_s == 0.0
+    score = scored(still)
+    assert score.outcome is CandidateClass.SETTLED
+    assert score.error_rad == pytest.approx(0.0, abs=1e-12)
+    assert score.effort_nm == pytest.approx(0.0, abs=1e-12)
+    assert score.settled_s == 0.0
 
 
-def test_hanging_arms_have_strayed_and_err_by_the_fall() -> None:
-    """They end in step, with e = 0 and no torque at all, and that makes them no better."""
+def test_hanging_arms_are_scored_by_their_fall() -> None:
+    """The arms end in step with e = 0 and no torque at all, which must not improve their score."""
     hanging = scored(trio(*FIRM, "control.gravity=0.0", "duration_s=20.0"))
     standing = scored(trio(*FIRM, "duration_s=20.0"))
     assert hanging.settled_s is not None  # all that e says
@@ -213,7 +211,7 @@ def test_hanging_arms_have_strayed_and_err_by_the_fall() -> None:
 
 
 def test_arms_that_sink_slowly_drift_before_they_hang() -> None:
-    """Damping holds them up for a while: 5 % of gravity, some 1.5 N m, against 100 N m s/rad."""
+    """Damping slows the fall: 5 % of gravity, some 1.5 N m, against 100 N m s/rad."""
     sinking = (
         *FIRM,
         "rate_hz=1000",
@@ -221,21 +219,21 @@ def test_arms_that_sink_slowly_drift_before_they_hang() -> None:
         "control.K=400.0",
         "control.gravity=0.95",
     )
-    found = scored(trio(*sinking, "duration_s=15.0"))
-    assert 0.02 < (found.pose_rad or 0.0) < 0.15
-    assert found.outcome is CandidateClass.OSCILLATED
+    score = scored(trio(*sinking, "duration_s=15.0"))
+    assert 0.02 < (score.pose_rad or 0.0) < 0.15
+    assert score.outcome is CandidateClass.OSCILLATED
 
 
-def test_what_diverged_has_no_error() -> None:
-    found = scored(trio(*FIRM, "limits.qd_limit_rad_s=0.2"))
-    assert found.outcome is CandidateClass.DIVERGED
-    assert found.error_rad is None
-    assert found.effort_nm is None
-    assert found.diverged_s is not None
+def test_diverged_runs_have_no_error() -> None:
+    score = scored(trio(*FIRM, "limits.qd_limit_rad_s=0.2"))
+    assert score.outcome is CandidateClass.DIVERGED
+    assert score.error_rad is None
+    assert score.effort_nm is None
+    assert score.diverged_s is not None
 
 
-def test_sites_of_other_rates_are_compared_at_one_instant() -> None:
-    """A slave at a quarter of the rate moves the score by its coarser steps, and no more."""
+def test_sites_of_different_rates_are_compared_simultaneously() -> None:
+    """A slave at a quarter of the rate changes the score only by its coarser steps."""
     alike, mixed = (
         scored(trio(*FIRM, "rate_hz=400", *more)) for more in ((), ("sites.s.rate_hz=100",))
     )
@@ -243,7 +241,7 @@ def test_sites_of_other_rates_are_compared_at_one_instant() -> None:
     assert mixed.effort_nm == pytest.approx(alike.effort_nm, rel=0.2)
 
 
-def test_with_a_twin_the_pose_is_the_twins() -> None:
+def test_with_a_twin_the_goal_is_its_pose() -> None:
     push = (
         'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 1.2, peak_nm = [20.0, 0.0]}]'
     )

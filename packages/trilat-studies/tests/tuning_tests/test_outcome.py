@@ -1,4 +1,4 @@
-"""How a run ended by its posture: the class of a candidate, and warnings on a log."""
+"""The outcome of a run by its posture: the class of a candidate, and warnings on a log."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ FIT = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
 CALM = RunEnd(EndBehaviour.CONVERGED, FIT, FIT, 0.0, 0.0)
 
 
-def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
+def make_run_end(behaviour: EndBehaviour, **more: object) -> RunEnd:
     return CALM._replace(behaviour=behaviour, **more)  # type: ignore[arg-type]
 
 
@@ -31,20 +31,20 @@ def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
     ("end", "fall_rad", "apart_rad", "outcome"),
     [
         (CALM, 0.0, 0.0, CandidateClass.SETTLED),
-        (ended(EndBehaviour.DECAYS), 0.0, 0.0, CandidateClass.SETTLED),
-        (ended(EndBehaviour.HARDLY), 0.0, 0.0, CandidateClass.OPEN),
-        (ended(EndBehaviour.UNDECIDED), 0.0, 0.0, CandidateClass.OPEN),
-        (ended(EndBehaviour.GROWS, operator_acts=True), 0.0, 0.0, CandidateClass.OPEN),
-        (ended(EndBehaviour.BOUNDED), 0.0, 0.0, CandidateClass.OSCILLATED),
-        (ended(EndBehaviour.DRIFTS), 1.6, 0.0, CandidateClass.OSCILLATED),
-        (ended(EndBehaviour.GROWS), 0.0, 0.0, CandidateClass.OSCILLATED),
-        (ended(EndBehaviour.DIVERGED), 1.6, 0.5, CandidateClass.DIVERGED),
+        (make_run_end(EndBehaviour.DECAYS), 0.0, 0.0, CandidateClass.SETTLED),
+        (make_run_end(EndBehaviour.HARDLY), 0.0, 0.0, CandidateClass.OPEN),
+        (make_run_end(EndBehaviour.UNDECIDED), 0.0, 0.0, CandidateClass.OPEN),
+        (make_run_end(EndBehaviour.GROWS, operator_acts=True), 0.0, 0.0, CandidateClass.OPEN),
+        (make_run_end(EndBehaviour.BOUNDED), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (make_run_end(EndBehaviour.DRIFTS), 1.6, 0.0, CandidateClass.OSCILLATED),
+        (make_run_end(EndBehaviour.GROWS), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (make_run_end(EndBehaviour.DIVERGED), 1.6, 0.5, CandidateClass.DIVERGED),
         (CALM, 1.6, 0.5, CandidateClass.STRAYED),
-        (ended(EndBehaviour.UNDECIDED), 1.6, 0.5, CandidateClass.STRAYED),
+        (make_run_end(EndBehaviour.UNDECIDED), 1.6, 0.5, CandidateClass.STRAYED),
         (CALM, 0.1, 0.5, CandidateClass.APART),
     ],
 )
-def test_class_is_judgement_of_run_and_pose(
+def test_class_combines_judgement_and_pose(
     end: RunEnd, fall_rad: float, apart_rad: float, outcome: CandidateClass
 ) -> None:
     assert classify_candidate((end, end), fall_rad, apart_rad) is outcome
@@ -52,7 +52,7 @@ def test_class_is_judgement_of_run_and_pose(
     assert classify_candidate((CALM, end), fall_rad, apart_rad) is outcome
 
 
-def test_a_class_that_the_judgement_decides_bears_its_word() -> None:
+def test_judgements_that_decide_a_class_name_it() -> None:
     words = {one: one.word for one in CandidateClass}
     assert words[CandidateClass.SETTLED] == Stability.STABLE
     assert words[CandidateClass.OSCILLATED] == Stability.NOT_STABLE
@@ -67,37 +67,37 @@ def test_every_outcome_has_a_meaning() -> None:
 FIRM = ("control.law=pd_d", "control.K=20.0", "control.d=9.0", "control.Kd=0.5")
 
 
-def test_arms_that_stand_need_no_word() -> None:
+def test_standing_arms_get_no_warning() -> None:
     assert check_final_posture(simulate(trio(*FIRM))) == []
 
 
-def test_arms_that_hang_are_named() -> None:
+def test_hanging_arms_are_named() -> None:
     (line,) = check_final_posture(
         simulate(trio(*FIRM, "control.gravity=0.0", "duration_s=15.0"))
     )
     assert line.startswith("m1, m2, s hang at the end")
 
 
-def test_arms_that_sank_are_told_how_far() -> None:
+def test_sunken_arms_are_named_with_their_distance() -> None:
     (line,) = check_final_posture(
         simulate(trio(*FIRM, "control.gravity=0.8", "duration_s=2.0"))
     )
     assert "from where a weightless consensus would stand: they sank, or drifted" in line
 
 
-def test_arms_that_were_pushed_did_not_sink() -> None:
+def test_pushed_arms_count_as_not_sunken() -> None:
     push = (
         'sites.m1.hands=[{kind = "pulse", start_s = 0.1, end_s = 1.5, peak_nm = [40.0, 0.0]}]'
     )
     assert check_final_posture(simulate(trio(*FIRM, push))) == []
 
 
-def test_a_site_that_diverged_is_named() -> None:
+def test_a_diverged_site_is_named() -> None:
     (line,) = check_final_posture(simulate(trio(*FIRM, "limits.qd_limit_rad_s=0.1")))
     assert "diverged: its figures end there" in line
 
 
-def test_arms_that_began_hanging_do_not_fall() -> None:
+def test_arms_that_start_hanging_did_not_fall() -> None:
     down = (-1.5707963, 0.0)
     scenario = trio(*FIRM)
     sites = {
@@ -107,7 +107,7 @@ def test_arms_that_began_hanging_do_not_fall() -> None:
     assert check_final_posture(simulate(msgspec.structs.replace(scenario, sites=sites))) == []
 
 
-def test_a_log_that_was_cut_says_where(tmp_path: Path) -> None:
+def test_a_truncated_log_names_its_end(tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     assert record_virtual(trio(*FIRM, "duration_s=40.0"), path)
     whole = path.read_bytes()

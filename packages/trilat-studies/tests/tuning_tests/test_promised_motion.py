@@ -30,16 +30,16 @@ def push(user_nm: float = 0.0, slave_nm: float = 0.0) -> Array:
     return outside_nm
 
 
-def test_a_mass_on_a_spring_swings_as_in_closed_form() -> None:
+def test_mass_on_a_spring_has_closed_form_motion() -> None:
     """M qdd + B qd + K q = F: F / K (1 - exp(-s t) (cos(w t) + s / w sin(w t)))."""
-    found = move_impedance(MASTER, np.full((len(T_S), 1), 3.0), H_S)[:, 0]
+    motion = move_impedance(MASTER, np.full((len(T_S), 1), 3.0), H_S)[:, 0]
     decay = 10.0 / 4.0
     omega = np.sqrt(50.0 / 2.0 - decay**2)
     swing = np.cos(omega * T_S) + decay / omega * np.sin(omega * T_S)
-    assert found == pytest.approx(3.0 / 50.0 * (1.0 - np.exp(-decay * T_S) * swing), abs=1e-10)
+    assert motion == pytest.approx(3.0 / 50.0 * (1.0 - np.exp(-decay * T_S) * swing), abs=1e-10)
 
 
-def test_the_target_model_of_impedance_rests_as_its_page_says() -> None:
+def test_impedance_target_rests_as_documented() -> None:
     """docs/data/laws-unit-arm.csv: K = 50, shares .75 / .25, 3 N m on user 1: user 1 .06, slave .045."""
     target = MASTER.target_motion(make_run(push(user_nm=3.0), [MASTER, MASTER, SLAVE], 0.2))
     assert target is not None
@@ -47,7 +47,7 @@ def test_the_target_model_of_impedance_rests_as_its_page_says() -> None:
     assert target[:, -1, 0] - 0.2 == pytest.approx([0.06, 0.0, 0.045], abs=1e-6)
 
 
-def test_masters_of_the_target_model_feel_their_share_of_the_wall() -> None:
+def test_target_model_shares_the_walls_torque() -> None:
     """f_j = alpha_j tau_h: -2 N m at the slave are -1.5 and -0.5 N m at the users."""
     target = MASTER.target_motion(make_run(push(slave_nm=-2.0), [MASTER, MASTER, SLAVE]))
     assert target is not None
@@ -65,7 +65,7 @@ def test_sync_promises_agreement_and_no_pose() -> None:
     assert target[1] == pytest.approx((q[0] + q[1] + q[2]) / 3.0)
 
 
-def test_other_laws_promise_to_agree_at_the_pose_of_the_hands() -> None:
+def test_other_laws_promise_agreement_at_hands_pose() -> None:
     for name, kind in BUILT_IN.items():
         if name in ("impedance", "sync"):
             continue

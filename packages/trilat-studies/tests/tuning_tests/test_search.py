@@ -23,7 +23,7 @@ LAWS = st.sampled_from(sorted(SEARCH_SPACES))
 
 
 def bowl(gains: dict[str, float]) -> CandidateScore:
-    """Least error at the middle of every range; effort rises with the gains."""
+    """Returns a score with the least error at the middle of every range; effort rises with the gains."""
     log = sum(math.log(value) ** 2 for value in gains.values())
     return CandidateScore(CandidateClass.SETTLED, log, log, 0.0, sum(gains.values()), log, 0.0)
 
@@ -35,8 +35,8 @@ def lost(_: dict[str, float]) -> CandidateScore:
 def searched(law: str, budget: int, seed: int, score: object = bowl) -> CandidateSearch:
     search = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR)
     for number in range(len(search.rounds)):
-        asked = search.propose_candidates(number)
-        search.record_scores(asked, [score(gains) for gains in asked])  # type: ignore[operator]
+        candidates = search.propose_candidates(number)
+        search.record_scores(candidates, [score(gains) for gains in candidates])  # type: ignore[operator]
     return search
 
 
@@ -63,10 +63,8 @@ def test_the_seed_decides_all(law: str, budget: int, seed: int) -> None:
 
 @settings(max_examples=20)
 @given(law=LAWS, budget=BUDGETS, seed=SEEDS)
-def test_the_first_half_samples_every_slice_of_every_range(
-    law: str, budget: int, seed: int
-) -> None:
-    """What makes a Latin hypercube of it (McKay, Beckman and Conover 1979)."""
+def test_first_half_samples_every_slice_of_ranges(law: str, budget: int, seed: int) -> None:
+    """This is the property of a Latin hypercube (McKay, Beckman and Conover 1979)."""
     first = CandidateSearch(
         SEARCH_SPACES[law], budget, seed, Objective.ERROR
     ).propose_candidates(0)
@@ -78,7 +76,7 @@ def test_the_first_half_samples_every_slice_of_every_range(
         assert np.abs(counts - 1).sum() <= 2  # four digits may carry one across an edge
 
 
-def test_laws_with_as_many_gains_begin_at_the_same_places() -> None:
+def test_laws_with_equal_gains_begin_at_equal_places() -> None:
     firsts = [
         CandidateSearch(SEARCH_SPACES[law], 16, 3, Objective.ERROR).propose_candidates(0)
         for law in ("adaptive", "adaptive_box")
@@ -87,8 +85,8 @@ def test_laws_with_as_many_gains_begin_at_the_same_places() -> None:
 
 
 @pytest.mark.parametrize("law", ["p_d", "adaptive"])
-def test_refinement_comes_nearer_than_the_hypercube_of_all(law: str) -> None:
-    """On a bowl whose bottom is known: 0 at gains of 1."""
+def test_refinement_beats_the_hypercube(law: str) -> None:
+    """On a bowl whose minimum is known: 0 at gains of 1."""
     refined = [
         min(s.error_rad or 0.0 for s in searched(law, 64, seed).scores) for seed in range(10)
     ]
@@ -118,7 +116,7 @@ SCORES = st.lists(
 
 
 @given(points=POINTS)
-def test_nothing_that_competes_is_better_than_point_of_front(
+def test_no_candidate_dominates_a_point_of_front(
     points: list[tuple[float, float] | None],
 ) -> None:
     competing = [point for point in points if point is not None]
@@ -128,7 +126,7 @@ def test_nothing_that_competes_is_better_than_point_of_front(
 
 
 @given(points=POINTS)
-def test_what_is_left_out_is_dominated_or_a_double(
+def test_every_omitted_candidate_is_dominated_or_double(
     points: list[tuple[float, float] | None],
 ) -> None:
     kept = set(find_pareto_front(points))
@@ -139,7 +137,7 @@ def test_what_is_left_out_is_dominated_or_a_double(
 
 
 @given(points=POINTS)
-def test_front_is_in_order_of_effort_and_its_objective_falls(
+def test_front_is_ordered_by_effort_against_objective(
     points: list[tuple[float, float] | None],
 ) -> None:
     kept = [point for n in find_pareto_front(points) if (point := points[n]) is not None]
@@ -148,14 +146,14 @@ def test_front_is_in_order_of_effort_and_its_objective_falls(
 
 
 @given(scores=SCORES)
-def test_only_runs_that_settled_compete(scores: list[CandidateScore]) -> None:
-    """Arms that hang have strayed: whatever their error and effort, they dominate nothing."""
+def test_only_settled_runs_compete(scores: list[CandidateScore]) -> None:
+    """Hanging arms have strayed: whatever their error and effort, they dominate nothing."""
     for objective in Objective:
         for n in find_pareto_front([objective.point(one) for one in scores]):
             assert scores[n].outcome is CandidateClass.SETTLED
 
 
-def test_ends_of_front_are_loneliest_and_equal_gaps_are_equal() -> None:
+def test_front_spacing_treats_ends_and_equal_gaps_alike() -> None:
     assert compute_crowding([(4.0, 0.0), (3.0, 1.0), (2.0, 2.0), (0.0, 4.0)]) == [
         float("inf"),
         1.0,

@@ -1,4 +1,4 @@
-"""Where laws are searched, and what all of them are told."""
+"""The ranges in which laws are searched, and the knowledge that all laws share."""
 
 import numpy as np
 import pytest
@@ -33,34 +33,34 @@ HELD = ("tdpa", "tanks", "wave")
 
 @pytest.mark.parametrize("law", sorted(SEARCH_SPACES))
 @pytest.mark.parametrize("scenario", ["contact", "free"])
-def test_a_candidate_changes_its_law_at_every_site_alone(law: str, scenario: str) -> None:
+def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> None:
     if law == "p_f" and scenario == "free":
         return
     scheme = ["scheme=digital"] if law in HELD else []
     experiment = load_tuning_scenario(scenario, ["limits.tau_limit_nm=60", *scheme])
-    found = experiment.with_gains(
+    candidate = experiment.with_gains(
         SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]
     ).scenario
-    for name, site in found.sites.items():
+    for name, site in candidate.sites.items():
         assert site.control.__struct_config__.tag == ("adaptive" if law == "known" else law)
         assert site.limits == experiment.scenario.sites[name].limits
         assert site.limits.tau_limit_nm == 60.0
         if site.control.plugged:
             assert getattr(site.control, "gravity", 0.95) == 0.95
             continue
-        known = site.control.gains(found.arms[name].theta)
+        known = site.control.gains(candidate.arms[name].theta)
         first = known.known if np.any(known.known) else known.theta_hat0
-        assert first[3:] == pytest.approx(0.95 * found.arms[name].theta[3:])
-    with_same_control = {name: site.control for name, site in found.sites.items()}
-    assert found.links == experiment.scenario.links
+        assert first[3:] == pytest.approx(0.95 * candidate.arms[name].theta[3:])
+    with_same_control = {name: site.control for name, site in candidate.sites.items()}
+    assert candidate.links == experiment.scenario.links
     assert len(with_same_control) == len(experiment.scenario.names)
 
 
-def test_sites_with_their_own_control_are_changed_one_by_one() -> None:
-    found: TuningScenario = load_tuning_scenario("contact").with_gains(
+def test_sites_with_own_control_are_changed_separately() -> None:
+    candidate: TuningScenario = load_tuning_scenario("contact").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
-    assert [text.partition("=")[0] for text in found.overrides] == [
+    assert [text.partition("=")[0] for text in candidate.overrides] == [
         "sites.m.control",
         "sites.s.control",
     ]
@@ -73,7 +73,7 @@ def test_sites_with_their_own_control_are_changed_one_by_one() -> None:
     )
 
 
-def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
+def test_equal_quantities_have_equal_ranges_in_laws() -> None:
     ranges: dict[str, set[tuple[str, float, float]]] = {}
     for space in SEARCH_SPACES.values():
         # of the place, in N s/m
@@ -81,40 +81,38 @@ def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
             ranges.setdefault(knob.name.partition("_")[0], set()).add(
                 (knob.unit, knob.low, knob.high)
             )
-    assert all(len(found) == 1 for found in ranges.values())
+    assert all(len(bounds) == 1 for bounds in ranges.values())
     assert ranges["d"] == {("N m s/rad", *next(iter(ranges["Kp"]))[1:])}
 
 
 def six(state: ChainState, **overrides: object) -> TuningScenario:
-    """`six_joints` of two equal start poses."""
+    """Returns `six_joints` with two equal start poses."""
     start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
     given = {"arm.stops": False, **start, **overrides}
     return load_tuning_scenario(
-        "six_joints", [f"{key}={format_toml_value(one)}" for key, one in given.items()]
+        "six_joints", [f"{key}={format_toml_value(value)}" for key, value in given.items()]
     )
 
 
-def test_joints_share_a_gain_by_the_inertia_of_pinocchio() -> None:
+def test_joints_share_gains_by_inertia_from_pinocchio() -> None:
     armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     for state in chain_references()["arm6"].states:
         inertia = 1.0 / np.diag(np.linalg.inv(state.inertia + np.diag(armature)))
         weights = weigh_joints(six(state).scenario)
         assert weights == pytest.approx(inertia / inertia.max(), rel=0.05)  # two digits
         gains = {"Lambda": 2.0, "Kp": 30.0, "Kd": 4.0, "Gamma": 0.5}
-        found = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
-        control = found.scenario.sites["m1"].control
+        candidate = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
+        control = candidate.scenario.sites["m1"].control
         assert control.Kp == pytest.approx(30.0 * np.array(weights))
         assert control.Kd == pytest.approx(4.0 * np.array(weights))
         assert control.Lambda == (2.0,) * 6
-        assert sum("control=" in text for text in found.overrides) == 1  # one for all sites
+        assert sum("control=" in text for text in candidate.overrides) == 1  # one for all sites
     assert weigh_joints(load_scenario("free")) == []
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("armature_kg_m2", [0.0, 0.001, 0.2])
-def test_every_choice_within_ranges_is_one_that_arms_can_take(
-    armature_kg_m2: float, scheme: str
-) -> None:
+def test_every_choice_within_ranges_is_a_valid_arm(armature_kg_m2: float, scheme: str) -> None:
     state, *_ = chain_references()["arm6"].states
     small = {"law": "p_d", "K": 1.0, "d": 1e-3}
     experiment = six(
@@ -147,13 +145,13 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
         ("own", ["no law 'own'"]),
     ],
 )
-def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:
+def test_untunable_settings_are_refused(law: str, facts: list[str]) -> None:
     with pytest.raises(UsageError) as refused:
         select_search_spaces([law], trio())
     assert all(fact in str(refused.value) for fact in facts)
 
 
-def test_force_reflection_is_refused_for_three_sites_with_the_reason() -> None:
+def test_force_reflection_is_refused_for_three_sites() -> None:
     with pytest.raises(
         ScenarioError,
         match="between one master and one slave; this scenario has 3 sites, 2 of them",
@@ -168,8 +166,10 @@ SHARES = st.floats(50.0, 150.0)
 
 
 @given(percent=SHARES)
-def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
-    """Otherwise V' <= 0 does not stand, and a law would be searched where it cannot work."""
+def test_ranges_hold_the_true_parameters_strictly_inside(percent: float) -> None:
+    """Otherwise V' <= 0 does not hold, and the search would include settings in which the law
+    cannot work.
+    """
     scenario, knowledge = trio(), build_model_information(percent)
     truth = scenario.arms["s"].theta
     low, high = knowledge.box_sides(scenario, "s")
@@ -178,7 +178,7 @@ def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
 
 
 @given(percent=SHARES)
-def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> None:
+def test_candidates_know_equal_gravity_and_no_inertia(percent: float) -> None:
     scenario = trio()
     prior = np.array(build_model_information(percent).prior(scenario, "m1"))
     # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)
@@ -188,6 +188,6 @@ def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> 
 
 
 @pytest.mark.parametrize("percent", [0.0, 49.0, 151.0, float("nan"), float("inf")])
-def test_what_nobody_could_be_told_is_refused(percent: float) -> None:
+def test_impossible_knowledge_is_refused(percent: float) -> None:
     with pytest.raises(UsageError, match="gravity_percent must be from 50 to 150 %"):
         build_model_information(percent)

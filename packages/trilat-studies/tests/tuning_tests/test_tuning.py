@@ -1,4 +1,4 @@
-"""The procedure as a whole: small budgets, short runs."""
+"""The whole procedure: small budgets, short runs."""
 
 import json
 import re
@@ -19,37 +19,41 @@ from trilat_studies.tuning.tuning_report import tabulate_front, tabulate_laws, w
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 
-from .experiments import asked, dominates
+from .experiments import dominates, plan_quick_tuning
 
 LAWS = ("adaptive", "p_d", "known")
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
-    """Three laws, six candidates each."""
-    return asked(tmp_path_factory.mktemp("tuned"), laws=LAWS, budget=6, seed=7).run(jobs=1)
+def tuning_result(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
+    """The result for three laws with six candidates each."""
+    return plan_quick_tuning(tmp_path_factory.mktemp("tuned"), laws=LAWS, budget=6, seed=7).run(
+        jobs=1
+    )
 
 
 @pytest.mark.long
-def test_same_request_makes_same_result_whatever_number_of_processes(
-    found: TuningResult, tmp_path: Path
+def test_the_number_of_processes_changes_no_result(
+    tuning_result: TuningResult, tmp_path: Path
 ) -> None:
-    again = asked(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
-    assert [one.tried for one in again.found] == [one.tried for one in found.found]
-    assert [one.scores for one in again.found] == [one.scores for one in found.found]
-    assert [one.score for one in again.printed] == [one.score for one in found.printed]
+    again = plan_quick_tuning(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
+    assert [law.tried for law in again.found] == [law.tried for law in tuning_result.found]
+    assert [law.scores for law in again.found] == [law.scores for law in tuning_result.found]
+    assert [candidate.score for candidate in again.printed] == [
+        candidate.score for candidate in tuning_result.printed
+    ]
 
 
-def test_every_law_has_its_budget_and_every_run_one_outcome(found: TuningResult) -> None:
-    for one in found.found:
-        assert len(one.tried) == len(one.scores) == sum(one.outcomes.values()) == 6
+def test_laws_use_their_budget_and_runs_end_once(tuning_result: TuningResult) -> None:
+    for law in tuning_result.found:
+        assert len(law.tried) == len(law.scores) == sum(law.outcomes.values()) == 6
 
 
-def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult) -> None:
+def test_candidates_differ_only_in_their_law(tuning_result: TuningResult) -> None:
     shared = set()
-    for one in found.found:
+    for one in tuning_result.found:
         for place in range(len(one.tried)):
-            scenario = found.candidate(one, place).scenario
+            scenario = tuning_result.candidate(one, place).scenario
             limits = tuple(site.limits for site in scenario.sites.values())
             starts = tuple(
                 (site.q0_rad, repr(site.arm), site.rate_hz, site.hands)
@@ -62,64 +66,70 @@ def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult)
     assert next(iter(shared))[0][0].tau_limit_nm == 60.0
 
 
-def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
+def test_a_front_is_dominated_by_no_law(tuning_result: TuningResult) -> None:
     points = {
-        one.space.law: [found.plan.objective.point(score) for score in one.scores]
-        for one in found.found
+        one.space.law: [tuning_result.plan.objective.point(score) for score in one.scores]
+        for one in tuning_result.found
     }
-    every = [point for law in points.values() for point in law if point is not None]
-    for one in found.found:
-        own = points[one.space.law]
-        assert one.front == find_pareto_front(own)
-        shared = found.list_overall_front(one)
+    all_points = [point for law in points.values() for point in law if point is not None]
+    for one in tuning_result.found:
+        own_points = points[one.space.law]
+        assert one.front == find_pareto_front(own_points)
+        shared = tuning_result.list_overall_front(one)
         assert set(shared) <= set(one.front)
         for place in one.front:
-            point = own[place]
+            point = own_points[place]
             assert point is not None
-            assert (place in shared) == (not any(dominates(other, point) for other in every))
-
-
-def test_a_points_command_runs_what_was_measured(found: TuningResult) -> None:
-    for one in found.found:
-        for place in one.front:
-            words = shlex.split(found.candidate(one, place).command)
-            assert words[:2] == ["trilat", "sim"]
-            assert words[3::2] == ["--set"] * (len(words[3:]) // 2)
-            assert (
-                measure_candidate(load_scenario(words[2], words[4::2]).text, None)
-                == one.scores[place]
+            assert (place in shared) == (
+                not any(dominates(other, point) for other in all_points)
             )
 
 
-def test_printed_gains_are_measured_and_never_searched(found: TuningResult) -> None:
-    told, untold = found.printed
-    assert [told.name, untold.name] == ["as printed", "as printed, told nothing"]
-    controls = [one.candidate.scenario.sites["s"].control.gains(None) for one in (told, untold)]  # type: ignore[arg-type]
+def test_the_command_of_a_point_repeats_its_run(tuning_result: TuningResult) -> None:
+    for law in tuning_result.found:
+        for place in law.front:
+            arguments = shlex.split(tuning_result.candidate(law, place).command)
+            assert arguments[:2] == ["trilat", "sim"]
+            assert arguments[3::2] == ["--set"] * (len(arguments[3:]) // 2)
+            assert (
+                measure_candidate(load_scenario(arguments[2], arguments[4::2]).text, None)
+                == law.scores[place]
+            )
+
+
+def test_printed_gains_are_measured_and_never_searched(tuning_result: TuningResult) -> None:
+    informed, untold = tuning_result.printed
+    assert [informed.name, untold.name] == ["as printed", "as printed, told nothing"]
+    controls = [
+        one.candidate.scenario.sites["s"].control.gains(None) for one in (informed, untold)
+    ]  # type: ignore[arg-type]
     assert [tuple(c.Lambda) for c in controls] == [(1.0, 1.0)] * 2
     assert [tuple(c.theta_hat0) for c in controls] == [(0.0, 0.0, 0.0, 2.0, 1.0), (0.0,) * 5]
-    every = {tuple(gains.values()) for one in found.found for gains in one.tried}
-    assert (1.0, 1.0, 3.0, 1.0) not in every
+    tried_gains = {tuple(gains.values()) for one in tuning_result.found for gains in one.tried}
+    assert (1.0, 1.0, 3.0, 1.0) not in tried_gains
 
 
-def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
-    """A speed limit that nothing keeps: no front, and no silence about it."""
-    found = asked(tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4).run(jobs=1)
-    law = found.to_dict()["laws"]["p_d"]
+def test_failed_runs_are_in_facts_and_counted(tmp_path: Path) -> None:
+    """No run keeps the speed limit: the front is empty, and the result says so."""
+    result = plan_quick_tuning(
+        tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4
+    ).run(jobs=1)
+    law = result.to_dict()["laws"]["p_d"]
     assert law["outcomes"] == {
         word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass
     }
     assert law["front"] == []
-    assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4
-    assert found.list_edge_gains(found.found[0]) == []
+    assert [candidate["outcome"] for candidate in law["candidates"]] == ["diverged"] * 4
+    assert result.list_edge_gains(result.found[0]) == []
 
 
-def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
-    """Gravity is told for half of what it is: no law that only knows it can stand, some that learn it can."""
+def test_hanging_arms_never_reach_a_real_front(tmp_path: Path) -> None:
+    """The laws are given half of gravity: a law that does not learn cannot stand, some that learn can."""
     settings = ("duration_s=10.0", "control.Kd=1")
-    found = asked(
+    result = plan_quick_tuning(
         tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0
     ).run(jobs=1)
-    learns, knows = found.found
+    learns, knows = result.found
     assert knows.front == []
     assert knows.outcomes[CandidateClass.STRAYED] >= 1
     assert knows.outcomes[CandidateClass.SETTLED] == 0
@@ -128,7 +138,7 @@ def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "phrase"),
     [
         (
             {"budget": 0},
@@ -141,12 +151,12 @@ def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
         ({"laws": ["p_dd"]}, "no law 'p_dd' to tune; did you mean"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(
-    tmp_path: Path, settings: dict[str, object], words: str
+def test_impossible_requests_are_refused(
+    tmp_path: Path, settings: dict[str, object], phrase: str
 ) -> None:
     with pytest.raises(UsageError) as refused:
-        asked(tmp_path, **settings)
-    assert words in str(refused.value)
+        plan_quick_tuning(tmp_path, **settings)
+    assert phrase in str(refused.value)
 
 
 def test_a_search_that_would_take_days_is_refused() -> None:
@@ -156,42 +166,46 @@ def test_a_search_that_would_take_days_is_refused() -> None:
         plan_tuning("free", ["duration_s=86400"])
 
 
-def test_time_is_told_before_and_is_of_right_order(tmp_path: Path) -> None:
-    few = asked(tmp_path, laws=["p_d"], budget=8)
+def test_time_is_estimated_beforehand_in_right_order(tmp_path: Path) -> None:
+    few = plan_quick_tuning(tmp_path, laws=["p_d"], budget=8)
     assert 0.0 < few.estimate_s(1) < 600.0
     assert few.runs == 10
-    assert asked(tmp_path, 'sites.s.environment=[{kind = "wall", point_m = [9.0, 0.0], normal = [-1.0, 0.0], '
+    assert plan_quick_tuning(tmp_path, 'sites.s.environment=[{kind = "wall", point_m = [9.0, 0.0], normal = [-1.0, 0.0], '
                  "stiffness_n_m = 1.0}]", laws=["p_d"], budget=8).runs == 20  # fmt: skip
 
 
 def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearch:
-    """A search of which so many candidates, all of the same gains, are on the front, the others on none."""
+    """A search with `count` candidates of equal gains on the front, and the others not."""
     search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
     outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
     scores = [
-        CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
-        for n, one in enumerate(outcomes, 1)
+        CandidateScore(outcome, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
+        for n, outcome in enumerate(outcomes, 1)
     ]
     search.record_scores([gains] * 6, scores)
     return search
 
 
-def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
+def test_tables_name_the_edge_of_the_searched_ranges(tuning_result: TuningResult) -> None:
     knob = SEARCH_SPACES["p_d"].knobs[0]
-    assert found.list_edge_gains(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == ["K"]
+    assert tuning_result.list_edge_gains(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == [
+        "K"
+    ]
 
 
 @pytest.fixture(scope="module")
-def written(found: TuningResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result_folder(
+    tuning_result: TuningResult, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """The folder of the result."""
     folder = tmp_path_factory.mktemp("written")
-    names = sorted(path.name for path in write_tuning(found, folder))
+    names = sorted(path.name for path in write_tuning(tuning_result, folder))
     assert names == ["front.json", "front.md", "front.pdf", "front.png"]
     return folder
 
 
-def test_the_folder_holds_the_result(written: Path) -> None:
-    result = json.loads((written / "front.json").read_text())
+def test_the_folder_holds_the_result(result_folder: Path) -> None:
+    result = json.loads((result_folder / "front.json").read_text())
     assert result["procedure"]["candidates_per_law"] == 6
     assert result["scenario"]["tau_limit_nm"] == {"m1": 60.0, "m2": 60.0, "s": 60.0}
     for law in ("p_d", "known"):
@@ -205,41 +219,44 @@ def test_the_folder_holds_the_result(written: Path) -> None:
             assert point["outcome"] == "settled"
 
 
-def test_the_figure_is_a_vector_one_column_wide(written: Path) -> None:
+def test_the_figure_is_a_vector_one_column_wide(result_folder: Path) -> None:
     """3.5 in are 252 pt, and 700 pixels at 200 to the inch."""
     box = re.search(
-        rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (written / "front.pdf").read_bytes()
+        rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (result_folder / "front.pdf").read_bytes()
     )
     assert box is not None
     assert float(box[1]) == pytest.approx(252.0)
-    header = (written / "front.png").read_bytes()[16:20]
+    header = (result_folder / "front.png").read_bytes()[16:20]
     assert int.from_bytes(header, "big") == 700
 
 
-def test_the_page_tells_procedure_search_and_commands(
-    found: TuningResult, written: Path
+def test_the_page_shows_procedure_search_and_commands(
+    tuning_result: TuningResult, result_folder: Path
 ) -> None:
-    text = (written / "front.md").read_text()
+    text = (result_folder / "front.md").read_text()
     assert "every law gets the exact gravity parameters" in text
     assert "torques clamped at 60 N m" in text
     assert "| p_d | K | N m/rad | 1 | 1000 | gravity |" in text
     assert "AND inertia exactly: more than the others" in text
-    assert text.count("trilat sim ") == sum(len(one.front) for one in found.found) + 2
+    assert text.count("trilat sim ") == sum(len(one.front) for one in tuning_result.found) + 2
     assert "as printed, told nothing" in text
 
 
-def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
-    table = tabulate_laws(found)
+def test_the_table_of_laws_counts_every_run(tuning_result: TuningResult) -> None:
+    table = tabulate_laws(tuning_result)
     places = [table.headers.index(outcome.word) for outcome in CandidateClass]
     for row in table.rows:
         assert sum(int(row[place]) for place in places) == int(row[1]) == 6
 
 
-def test_a_long_front_is_shortened_to_points_with_both_ends(found: TuningResult) -> None:
-    one = with_front("adaptive", found.found[0].tried[0], 5)
-    shown = [row[0].rstrip("*") for row in tabulate_front(found, one, 3).rows]
-    assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
-    assert len(tabulate_front(found, one).rows) == 5
+def test_long_fronts_are_shortened_between_both_ends(tuning_result: TuningResult) -> None:
+    one = with_front("adaptive", tuning_result.found[0].tried[0], 5)
+    shown_places = [row[0].rstrip("*") for row in tabulate_front(tuning_result, one, 3).rows]
+    assert shown_places == ["adaptive 1", "adaptive 3", "adaptive 5"]
+    assert len(tabulate_front(tuning_result, one).rows) == 5
     assert (
-        tabulate_front(found, with_front("adaptive", found.found[0].tried[0], 0), 3).rows == []
+        tabulate_front(
+            tuning_result, with_front("adaptive", tuning_result.found[0].tried[0], 0), 3
+        ).rows
+        == []
     )

@@ -756,7 +756,7 @@ _FINE_COLUMNS = 24
 """Least number of steps along x with which a line from theory is drawn."""
 
 
-class FineColumns(NamedTuple):
+class _FineColumns(NamedTuple):
     """Columns at which a line from theory is computed, between and beside those of a map.
 
     A map with few columns shows a line from theory only at these. Between them a straight
@@ -773,7 +773,7 @@ class FineColumns(NamedTuple):
     on_grid: tuple[int, ...]
 
 
-def refine_columns(axis: PlaneAxis, borders: Array) -> FineColumns:
+def refine_columns(axis: PlaneAxis, borders: Array) -> _FineColumns:
     """Divides the intervals between the columns of a map, unless these are many already.
 
     Args:
@@ -786,7 +786,7 @@ def refine_columns(axis: PlaneAxis, borders: Array) -> FineColumns:
     intervals = len(values) - 1
     parts = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
     if intervals < 1 or parts == 1:
-        return FineColumns(axis.values, tuple(positions.tolist()), tuple(range(len(values))))
+        return _FineColumns(axis.values, tuple(positions.tolist()), tuple(range(len(values))))
     indices = np.arange(intervals * parts + 1) / parts
     fine_values = np.interp(indices, np.arange(len(values)), values)
     fine_positions = np.interp(indices, np.arange(len(values)), positions)
@@ -800,7 +800,7 @@ def refine_columns(axis: PlaneAxis, borders: Array) -> FineColumns:
         fine_values = np.concatenate([before, fine_values, after])
         fine_positions = np.concatenate([before, fine_positions, after])
         on_grid = on_grid + len(before)
-    return FineColumns(
+    return _FineColumns(
         tuple(fine_values.tolist()), tuple(fine_positions.tolist()), tuple(on_grid.tolist())
     )
 
@@ -837,7 +837,7 @@ class MapLine(NamedTuple):
         """The quantity at the columns between which the line is drawn."""
         return self.fine_excess if self.fine_positions else self.excess
 
-    def thin_out(self, columns: FineColumns) -> "MapLine":
+    def thin_out(self, columns: _FineColumns) -> "MapLine":
         """Returns this line, given at fine columns, with the columns of the map apart.
 
         Args:
@@ -1212,7 +1212,7 @@ def build_stability_map(
     return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
 
 
-def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) -> FineColumns:
+def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) -> _FineColumns:
     """Returns the columns at which lines from theory are computed.
 
     They are those of the map if the scenario is not valid between them, for example because
@@ -1224,7 +1224,7 @@ def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) 
             for value in fine.values:
                 load(value, y.values[0])
     except ScenarioError:
-        return FineColumns(x.values, tuple(x.positions.tolist()), tuple(range(len(x.values))))
+        return _FineColumns(x.values, tuple(x.positions.tolist()), tuple(range(len(x.values))))
     return fine
 
 

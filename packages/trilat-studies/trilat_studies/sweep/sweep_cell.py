@@ -264,14 +264,17 @@ def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCe
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution.lanes import find_obstacle, group_runs
+    from trilat_net.execution.lanes import group_runs
 
     cells = [_CellInProgress(parse_scenario(text), longest_s) for text in texts]
     runs = [cell.run for cell in cells]
+    obstacles = [""] * len(cells)
     for group in group_runs(runs):
+        for index in group.members:
+            obstacles[index] = group.obstacle
         _run_group(group, cells)
-    for cell in cells:
-        yield _JudgedCell(cell.judge(), find_obstacle(cell.run))
+    for cell, obstacle in zip(cells, obstacles, strict=True):
+        yield _JudgedCell(cell.judge(), obstacle)
 
 
 def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:

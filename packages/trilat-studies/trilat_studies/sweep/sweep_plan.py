@@ -28,9 +28,9 @@ import numpy as np
 from trilat_net.analysis.metrics.log_metrics import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
 from trilat_net.fields import split_unit
+from trilat_net.own_code.code_consent import allow_own_code
+from trilat_net.own_code.imported_code import name_law_classes
 from trilat_net.scenario import Scenario, apply_overrides
-from trilat_net.scenario.code_consent import allow_own_code
-from trilat_net.scenario.imported_code import name_law_classes
 from trilat_net.scenario.key_checks import is_number
 from trilat_net.scenario.laws import LAWS, identify_law
 from trilat_net.scenario.scenario_reader import ExperimentText, read_experiment

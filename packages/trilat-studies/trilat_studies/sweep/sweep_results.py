@@ -330,11 +330,8 @@ def read_results(path: Path) -> SweepResults:
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
 
-    csv.field_size_limit(_LONGEST_CELL)
     try:
-        with file.open(encoding="utf-8", newline="") as stream:
-            reader = csv.DictReader(stream, strict=True)
-            lines = list(reader)
+        lines = _read_lines(file)
         rows = [_read_row(line, plan) for line in lines]
     except KeyError as error:
         raise UsageError(
@@ -343,6 +340,19 @@ def read_results(path: Path) -> SweepResults:
     except (OSError, ValueError, TypeError, IndexError, csv.Error) as error:
         raise UsageError(f"{file}: cannot be read as results of a sweep: {error}") from None
     return SweepResults(plan, rows)
+
+
+def _read_lines(file: Path) -> list[dict[str, str]]:
+    """Reads the CSV table of a sweep, whose cells may hold the whole text of a scenario.
+
+    The limit of the csv module applies to the whole process. Therefore it is raised only here.
+    """
+    limit = csv.field_size_limit(_LONGEST_CELL)
+    try:
+        with file.open(encoding="utf-8", newline="") as stream:
+            return list(csv.DictReader(stream, strict=True))
+    finally:
+        csv.field_size_limit(limit)
 
 
 def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:

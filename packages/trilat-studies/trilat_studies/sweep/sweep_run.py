@@ -24,13 +24,19 @@ from typing import Any, NamedTuple
 import msgspec
 
 from trilat_net.analysis.metrics.log_metrics import measure_run
-from trilat_net.errors import ScenarioError, UsageError, count_nouns, format_wall_time
+from trilat_net.errors import (
+    CodeFailed,
+    ScenarioError,
+    UsageError,
+    count_nouns,
+    format_wall_time,
+)
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net.clock import SystemClock
+from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.laws import identify_law
 from trilat_net.work import executor
 from trilat_net.work.study_folder import (
@@ -328,7 +334,13 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
             problem = error
             break
     texts = [scenario.text for scenario in scenarios]
-    judged_cells = sweep_cell.classify_cells(texts, tasks[0].plan.longest_s)
+    try:
+        judged_cells = list(sweep_cell.classify_cells(texts, tasks[0].plan.longest_s))
+    except CodeFailed:
+        # One by one, the runs before the one whose code fails are kept.
+        for task in tasks:
+            yield run_cell(task)
+        return
     for task, scenario, judged in zip(tasks, scenarios, judged_cells, strict=False):
         run = _complete_run(task, scenario, judged.result)
         yield msgspec.structs.replace(run, alone=judged.obstacle)

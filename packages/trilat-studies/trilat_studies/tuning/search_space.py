@@ -33,14 +33,14 @@ from trilat_net.laws.interface import (
     GainRange,
     TuningSite,
 )
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.imported_code import (
+from trilat_net.own_code.imported_code import (
     CodeConsent,
     CodeKey,
     allowed_code,
     import_class,
     read_code,
 )
+from trilat_net.scenario import Scenario
 from trilat_net.scenario.key_checks import is_number
 from trilat_net.scenario.laws import BUILT_IN
 

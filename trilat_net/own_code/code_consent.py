@@ -21,7 +21,7 @@ import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
@@ -31,6 +31,8 @@ from .imported_code import (
     CodeConsent,
     CodeKey,
     ImportedLaw,
+    NamedCode,
+    ScenarioWithCode,
     allowed_code,
     check_class,
     describe_new_settings,
@@ -39,21 +41,13 @@ from .imported_code import (
     read_code,
     remembered_settings,
 )
-from .operators.program_hand import ProgramHand
-from .own_plant import OwnPlant
 
-if TYPE_CHECKING:
-    from .scenario_types import Scenario
-
+AnyScenario = TypeVar("AnyScenario", bound=ScenarioWithCode)
 LawFiles = str | Path | Sequence[str | Path]
 """File with code of a user, or several such files."""
 
 
-ImportedCode = ImportedLaw | ProgramHand | OwnPlant
-"""Parts of a scenario that are classes of users."""
-
-
-def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
+def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[NamedCode]:
     """Returns the users' classes that scenarios name, and that would run with them.
 
     These are control laws, operators (programs that move an arm) and plants (programs that
@@ -66,15 +60,15 @@ def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
     for scenario in scenarios:
         for site in scenario.sites.values():
             candidates = (site.control, *site.hands, site.plant)
-            imported += [part for part in candidates if isinstance(part, ImportedCode)]
+            imported += [part for part in candidates if isinstance(part, NamedCode)]
     return imported
 
 
 def allow_own_code(
-    scenario: "Scenario",
+    scenario: AnyScenario,
     codes: Container[Any] | None = None,
-    changed_from: "Scenario | None" = None,
-) -> "Scenario":
+    changed_from: ScenarioWithCode | None = None,
+) -> AnyScenario:
     """Allows the code that a scenario names to run, because a user of this process named it.
 
     The program runs users' classes only with permission, since a scenario from elsewhere may
@@ -119,7 +113,7 @@ class _RememberedFile(msgspec.Struct):
 
 
 def allow_logged_code(
-    scenario: "Scenario",
+    scenario: ScenarioWithCode,
     law: LawFiles = (),
     *,
     other_version: bool = False,
@@ -219,7 +213,7 @@ def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
 
 
 def _allow_file(
-    file: Path, logged: Mapping[CodeKey, ImportedCode], *, other_version: bool
+    file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
     """Allows a file to run as code that a log names.
 
@@ -307,7 +301,7 @@ class _LoggedUserLaw(NamedTuple):
         return f"{problem}; if you trust it: --law {option}"
 
 
-def find_user_laws(scenario: "Scenario") -> list[_LoggedUserLaw]:
+def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
     """Returns the control laws in a scenario that are users' classes.
 
     None of their code is run. Each entry tells whether the law may run, and which file would be
@@ -326,7 +320,7 @@ def find_user_laws(scenario: "Scenario") -> list[_LoggedUserLaw]:
     return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
 
 
-def may_run_user_laws(scenario: "Scenario") -> bool:
+def may_run_user_laws(scenario: ScenarioWithCode) -> bool:
     """Returns True if every control law in a scenario that is a user's class may run.
 
     Whoever permitted the laws of a log also permitted what repeats its run: twins, roots and

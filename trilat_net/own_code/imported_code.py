@@ -21,12 +21,12 @@ import hashlib
 import importlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 from msgspec import Meta, field
 
@@ -68,12 +68,18 @@ def call_directly(_k: int, function: Callable[[], Any]) -> Any:
     return function()
 
 
-class _NamedCode(Protocol):
+@runtime_checkable
+class NamedCode(Protocol):
     """Interface of an entry of a scenario that names a user's class.
 
     The class is a control law, an operator (a program that moves an arm) or a plant (a program
     that computes the motion of an arm).
+
+    Attributes:
+        method: Method that the class must have.
     """
+
+    method: ClassVar[str]
 
     @property
     def code(self) -> str:
@@ -86,6 +92,30 @@ class _NamedCode(Protocol):
     @property
     def settings(self) -> dict[str, Any]:
         """Arguments by name with which an object of the user's class is created."""
+
+
+class SiteWithCode(Protocol):
+    """Interface of a site of a scenario whose parts may be classes of users."""
+
+    @property
+    def control(self) -> Any:
+        """Control law of the site."""
+
+    @property
+    def hands(self) -> Sequence[Any]:
+        """Operators who move the arm of the site."""
+
+    @property
+    def plant(self) -> Any:
+        """What computes the motion of the arm."""
+
+
+class ScenarioWithCode(Protocol):
+    """Interface of a scenario, the description of an experiment, that may name classes."""
+
+    @property
+    def sites(self) -> Mapping[str, SiteWithCode]:
+        """The sites, each of which is a process that controls one arm, by name."""
 
 
 ANY_SETTINGS = "*"
@@ -113,7 +143,7 @@ class CodeKey(NamedTuple):
     settings: str
 
     @classmethod
-    def of(cls, named: _NamedCode) -> "CodeKey":
+    def of(cls, named: NamedCode) -> "CodeKey":
         """Returns the identification under which a user's class may be permitted to run.
 
         Args:

@@ -48,7 +48,7 @@ class ScriptedDevice:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing holds it."""
+        """Releases nothing, because the device holds nothing."""
 
     def read(self) -> DeviceState:
         if self.t_s >= self._hangs_s[0]:
@@ -97,7 +97,7 @@ class HaplyService:
         return f"ws://127.0.0.1:{self.port}"
 
     def kill(self) -> None:
-        """Ends it as a killed process ends: connections break, and nobody listens."""
+        """Ends the service like a killed process: connections break, and nobody listens."""
         self._server.shutdown()
         for connection in self._open:
             with suppress(OSError):
@@ -106,7 +106,7 @@ class HaplyService:
 
     @property
     def forces(self) -> list[Vector]:
-        """The forces that it was sent, as the key that it knows has them."""
+        """Returns the received forces, by the key under which the service knows them."""
         return [self._force(message) for _, message in self.asked]
 
     def _force(self, message: dict[str, Any]) -> Vector:
@@ -151,7 +151,7 @@ class CapReports:
         self.path = f"/proc/self/fd/{self._read}"
 
     def push(self, right: int, near: int, down: int) -> None:
-        """The cap is pushed, in counts of its axes."""
+        """Pushes the cap, in counts of its axes."""
         numbers = (right, near, down, 0, 0, 0)
         os.write(
             self._write,

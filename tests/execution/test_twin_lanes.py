@@ -1,0 +1,99 @@
+"""A run and its twins side by side in lanes are the run and its twins one by one, bit for bit."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from trilat_net.execution import twins as twins_module
+from trilat_net.execution.lanes import twin_lanes
+from trilat_net.execution.twins import (
+    Push,
+    Twins,
+    choose_pushes,
+    parse_push,
+    run_twins,
+    run_virtual_twins,
+)
+from trilat_net.scenario import Scenario, load_scenario
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+Runner = Callable[[], Twins]
+
+
+def check_both_ways(monkeypatch: pytest.MonkeyPatch, run: Runner) -> Twins:
+    """Runs twins in lanes and one by one, checks that they are equal, and returns them."""
+    monkeypatch.setattr(twins_module, "LANE_SITE_TICKS", 0)
+    calls = []
+    step_to = twin_lanes.TwinLanes.step_to
+
+    def count_steps(lanes: twin_lanes.TwinLanes, last_ns: int) -> None:
+        calls.append(last_ns)
+        step_to(lanes, last_ns)
+
+    monkeypatch.setattr(twin_lanes.TwinLanes, "step_to", count_steps)
+    in_lanes = run()
+    assert calls
+    monkeypatch.setattr(twin_lanes, "LEAST_RUNS", 100)
+    calls.clear()
+    alone = run()
+    assert not calls
+    assert (in_lanes.joints, in_lanes.same) == (alone.joints, alone.same)
+    assert in_lanes.speed.tobytes() == alone.speed.tobytes()
+    for path, expected in zip(in_lanes.paths, alone.paths, strict=True):
+        assert (path.pushed, path.died) == (expected.pushed, expected.died)
+        for name in ("t_s", "largest", "last", "scale"):
+            assert getattr(path, name).tobytes() == getattr(expected, name).tobytes()
+    return in_lanes
+
+
+def push_in_many_ways(scenario: Scenario, site: str) -> list[Push]:
+    """At the start, in the middle, so often that differences are scaled, and of the estimate."""
+    often = parse_push(scenario, f"{site}.q1", 1e-9)._replace(largest=2e-9)
+    return [
+        parse_push(scenario, f"{site}.q1"),
+        often,
+        parse_push(scenario, f"{site}.qd2", 1e-6, 1.3),
+        parse_push(scenario, "q", 1e-5),
+    ]
+
+
+@pytest.mark.parametrize("name", ["live-4g", "live-paper"])
+def test_twins_of_a_live_log_are_equal_in_lanes(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    log = tn.open_log(GOLDEN / f"{name}.mcap")
+    twins = check_both_ways(monkeypatch, lambda: run_twins(log, choose_pushes(log.scenario)))
+    assert twins.same
+    assert np.isfinite(twins.paths[0].largest).any()
+
+
+def test_scaled_twins_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_rest = {f"sites.{site}.q0_rad": [0.3, 0.5] for site in ("m1", "m2", "s")}
+    scenario = load_scenario("p_d_margin", {"control.K": 40.0, "control.d": 0.5, **at_rest})
+    pushes = push_in_many_ways(scenario, "m1")
+    twins = check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))
+    assert twins.paths[1].scale.any()
+    assert twins.paths[2].pushed == (26,)
+
+
+def test_twins_of_a_compiled_law_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    wave = {"control.law": "wave", "scheme": "digital"}
+    scenario = load_scenario("two_sites", {"link.delay_ms": 120.0, **wave})
+    pushes = push_in_many_ways(scenario, "m")
+    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))
+
+
+def test_twins_of_a_chain_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = load_scenario("six_joints")
+    pushes = push_in_many_ways(scenario, scenario.names[0])
+    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 2.0))
+
+
+def test_twins_that_leave_their_limits_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm passes its speed limit after some windows; the lanes then start again one by one."""
+    scenario = load_scenario("two_sites", {"limits.qd_limit_rad_s": 1.0})
+    pushes = push_in_many_ways(scenario, "m")
+    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))

@@ -1,0 +1,284 @@
+# mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
+# mypy: disable-error-code="no-any-return"
+"""Computes the torque of compiled control laws for several runs side by side.
+
+A compiled law is a class that is not a part of the kernel, for example `tdpa` or a law of a
+user. The kernel calls the method `torque` by its address. In lanes the method is compiled as a
+part of the tick, with rows in a lane as its input. This saves the call and the checks of the
+lengths of all vectors, which are constants here.
+
+Invariant:
+    - The method is not changed. It raises the same errors, and reads and writes the same
+      numbers, as in a run of its own.
+    - A law of a user is compiled in each process, because it may use files that are unknown. A
+      law of this package is stored under a hash of its sources.
+"""
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from itertools import count
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.extending import intrinsic, models, register_jitable, register_model
+
+from ...core.plug.compiled_law import (
+    CHECKED,
+    CompiledLaw,
+    LawForm,
+    collect_law_input,
+    finish_law,
+)
+from ...core.plug.law_view import update_law_view
+from ...core.plug.plugged import digest_sibling_sources
+from ...core.step.jit import leaf, set_lane_form
+from ...core.step.ticks import Mode
+from ...core.step.vectors import RowArray
+from .lane_rows import Constants, LaneTable, RowsInLane, offset_rows
+
+_DIVERGED = int(Mode.DIVERGED)
+NO_LAW = "none"
+"""Name of the law of a site whose law is a part of the kernel."""
+
+
+class LaneLaw(NamedTuple):
+    """A compiled law of one site in a run, as far as it decides about the compiled code.
+
+    Attributes:
+        name: Name of the law, from all that its code depends on. `NO_LAW` without such a law.
+        is_stored: True if the compiled code may be stored on disk.
+        size: Count of numbers of the law.
+        constants: Flags among them: integers that are 0 or 1 and do not change. They are equal
+            in all runs.
+        columns: For each peer the indices of the numbers that the law receives among the
+            numbers that the peer sends; -1: the peer does not send the number.
+    """
+
+    name: str
+    is_stored: bool
+    size: int
+    constants: Constants
+    columns: tuple[tuple[int, ...], ...]
+
+
+class _LawMethod(NamedTuple):
+    """The method of a law that computes its torque, and the layouts of its arrays."""
+
+    torque: Callable[..., Any]
+    form: LawForm
+
+
+_METHODS: dict[str, _LawMethod] = {}
+"""Methods of laws by the names of the laws."""
+_user_law_numbers = count()
+
+
+@cache
+def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
+    """Returns a name for a law, and whether its code may be stored under this name."""
+    sources = digest_sibling_sources(torque)
+    text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
+    name = hashlib.sha256(text.encode()).hexdigest()[:32]
+    if not sources:
+        name = f"user{next(_user_law_numbers)}"
+    _METHODS[name] = _LawMethod(torque, form)
+    return name, bool(sources)
+
+
+def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
+    """Returns what decides about the compiled code of a site's law.
+
+    Args:
+        law: The law; None if the law of the site is a part of the kernel.
+        columns: Indices of the numbers that the law receives, shape (P, C).
+    """
+    if law is None:
+        return LaneLaw(NO_LAW, is_stored=True, size=0, constants=(), columns=())
+    form = law.form
+    name, is_stored = _name_law(law.torque, form)
+    size = form.law.itemsize // 8
+    row = law.row[:size].view(form.law)[0]
+    constants = []
+    for field, (dtype, *_) in (form.law.fields or {}).items():
+        # Other integers may be an axis of a study, whose runs then still have one structure.
+        if dtype.kind == "i" and not dtype.shape and row[field] in (0, 1):
+            constants.append((field, int(row[field])))
+    return LaneLaw(
+        name=name,
+        is_stored=is_stored,
+        size=size,
+        constants=tuple(constants),
+        columns=tuple(tuple(peer) for peer in columns.tolist()),
+    )
+
+
+class LawCode(types.Type):
+    """Numba's type of a value that stands for the code of a law.
+
+    Args:
+        law: The law.
+    """
+
+    in_lanes = True
+
+    def __init__(self, law: LaneLaw) -> None:
+        self.law_name = law.name
+        self.constants = law.constants
+        self.is_stored = law.is_stored
+        super().__init__(f"LawCode({law.name}, {law.constants})")
+
+    @property
+    def mangling_args(self) -> tuple[str, tuple[str]]:
+        """Name of the type in symbols of machine code."""
+        digest = hashlib.sha256(self.name.encode()).hexdigest()
+        return "LawCode", (f"c{digest[:16]}",)
+
+
+@register_model(LawCode)
+class _CodeModel(models.PrimitiveModel):
+    """The value is a pointer, which is not used."""
+
+    def __init__(self, manager: Any, numba_type: Any) -> None:
+        super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
+
+
+def _make_view(
+    dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
+) -> Any:
+    """Returns a compiled function that reads the numbers of a row as rows of another layout.
+
+    Args:
+        dtype: Layout of the rows. None if there are no such rows.
+        rows: Number of rows.
+        first_word: Index of the first number.
+        constants: Fields that are equal in all lanes.
+    """
+    if dtype is None:
+        return _no_rows
+    row_type = LaneTable(dtype, (constants,) * rows)
+
+    @intrinsic
+    def view(_context: Any, numbers: Any) -> Any:
+        rows_type = RowsInLane(row_type, row_type.constants)
+
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            source = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0])
+            target = cgutils.create_struct_proxy(rows_type)(context, builder)
+            target.pointer = offset_rows(builder, source.pointer, first_word)
+            target.lane = source.lane
+            return target._getvalue()
+
+        return rows_type(numbers), generate
+
+    return view
+
+
+@register_jitable
+def _no_rows(_numbers: Any) -> tuple[()]:
+    """Returns no rows, in place of a view of rows."""
+    return ()
+
+
+@register_jitable
+def _first_row(rows: Any) -> Any:
+    """Returns the only row."""
+    return rows[0]
+
+
+@register_jitable
+def _no_row(_rows: Any) -> None:
+    """Returns no row."""
+
+
+@leaf
+def compute_law(
+    code: Any,
+    k: int,
+    t_ns: int,
+    site: RowArray,
+    links: RowArray,
+    law: RowArray,
+    received: RowArray,
+    sent: RowArray,
+) -> None:
+    """Computes the torque of a compiled law in one lane, see `law_stage`.
+
+    Nothing happens if the law of the site is a part of the kernel.
+
+    Args:
+        code: Stands for the code of the law.
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        site: Row of the site, in which the torque is written.
+        links: Rows of the site's links.
+        law: Row with the numbers of the law; changed.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that this law sends; written.
+
+    Raises:
+        FloatingPointError: A result is not finite.
+    """
+    raise NotImplementedError  # each law has a form of its own, see `set_lane_form`
+
+
+def _compute_nothing(
+    _code: Any,
+    _k: int,
+    _t_ns: int,
+    _site: Any,
+    _links: Any,
+    _law: Any,
+    _received: Any,
+    _sent: Any,
+) -> None:
+    """Form of `compute_law` for a site whose law is a part of the kernel."""
+
+
+def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
+    """Returns the form of `compute_law` for the law of a site."""
+    code = argument_types[0]
+    if code.law_name == NO_LAW:
+        return _compute_nothing
+    method = _METHODS[code.law_name]
+    form = method.form
+    to_all_size = 0 if form.to_all is None else form.to_all.itemsize // 8
+    compute = numba.njit(**CHECKED)(method.torque)
+    view_law = _make_view(form.law, 1, 0, code.constants)
+    view_received = _make_view(form.received, form.peers, 0)
+    view_to_all = _make_view(form.to_all, 1, 0)
+    view_sent = _make_view(form.sent, form.peers, to_all_size)
+    choose_row = _no_row if form.to_all is None else _first_row
+
+    def compute_torque(
+        _code: Any,
+        k: int,
+        t_ns: int,
+        site: Any,
+        links: Any,
+        law: Any,
+        received: Any,
+        sent: Any,
+    ) -> None:
+        """Form of `compute_law` for this law."""
+        s = site[0]
+        if s.mode == _DIVERGED:
+            return
+        update_law_view(k, t_ns, site, links, None)
+        now = collect_law_input(
+            s,
+            links,
+            view_received(received),
+            view_sent(sent),
+            choose_row(view_to_all(sent)),
+        )
+        compute(view_law(law)[0], now)
+        finish_law(s, law[0].numbers, sent[0].numbers[: s.sent])
+
+    return compute_torque
+
+
+set_lane_form(compute_law, _choose_law)

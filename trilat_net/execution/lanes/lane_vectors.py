@@ -1,0 +1,443 @@
+# mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
+# mypy: disable-error-code="no-any-return, override"
+"""Defines numbers of eight runs as one value, for functions whose loops cannot be turned.
+
+The recursions of a chain of joints are loops over the joints. A compiler that may choose the
+loop to use vectors for chooses these, which needs many single reads. Here a value of a function
+of the kernel is a vector with a number of each of eight runs instead. The loops over the joints
+stay as they are, and each operation is one instruction.
+
+A function that branches on such a value is refused when it is compiled. It must use `choose`.
+
+Invariant:
+    - Each number of a result depends on the same numbers, by the same operations, as in a run
+      of its own.
+"""
+
+import hashlib
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.extending import intrinsic, lower_cast, models, register_model
+from numba.core.imputils import lower_builtin, lower_getattr_generic, lower_setattr_generic
+from numba.core.typeconv.castgraph import Conversion
+from numba.core.typing.templates import (
+    AbstractTemplate,
+    AttributeTemplate,
+    infer_getattr,
+    infer_global,
+    signature,
+)
+from numba.np import arrayobj
+
+from ...core.step.jit import set_lane_form
+from ...core.step.vectors import choose, round_down, whole
+from .lane_rows import LANES, Constants, LaneField, LaneTable, offset_rows
+
+GROUP = 8
+"""Number of runs whose numbers form one value: the doubles of the longest register."""
+_WORD = 8
+_WORD_TYPE = ir.IntType(64)
+_LLVM_KINDS = {
+    "f8": ir.VectorType(ir.DoubleType(), GROUP),
+    "i8": ir.VectorType(_WORD_TYPE, GROUP),
+    "b1": ir.VectorType(ir.IntType(1), GROUP),
+}
+
+
+class LaneVector(types.Type):
+    """Numba's type of a number of eight runs.
+
+    Args:
+        kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.
+    """
+
+    in_lanes = True
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        super().__init__(f"LaneVector({kind}, {GROUP})")
+
+    @property
+    def mangling_args(self) -> tuple[str, tuple[str]]:
+        """Name of the type in symbols of machine code."""
+        return "LaneVector", (self.kind,)
+
+    def can_convert_from(self, _context: Any, other: Any) -> Any:
+        """A number that is equal in all runs can stand for a vector of floats."""
+        is_number = isinstance(other, types.Float | types.Integer)
+        return Conversion.safe if is_number and self.kind == "f8" else None
+
+    def unify(self, _context: Any, other: Any) -> Any:
+        """A variable that is a vector in one branch, and a number in another, is a vector."""
+        is_number = isinstance(other, types.Float | types.Integer)
+        return self if is_number and self.kind == "f8" else None
+
+
+FLOATS = LaneVector("f8")
+INTEGERS = LaneVector("i8")
+CONDITIONS = LaneVector("b1")
+
+
+@register_model(LaneVector)
+class _VectorModel(models.PrimitiveModel):
+    """A vector is represented by a vector of LLVM."""
+
+    def __init__(self, manager: Any, numba_type: LaneVector) -> None:
+        super().__init__(manager, numba_type, _LLVM_KINDS[numba_type.kind])
+
+
+def _repeat(builder: Any, number: Any, vector_type: Any) -> Any:
+    """Generates a vector of equal numbers."""
+    undefined = ir.Constant(vector_type, ir.Undefined)
+    first = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    places = ir.Constant(ir.VectorType(ir.IntType(32), GROUP), [0] * GROUP)
+    return builder.shuffle_vector(first, undefined, places)
+
+
+def _cast_number(context: Any, builder: Any, source: Any, _target: Any, number: Any) -> Any:
+    """Generates the conversion of a number to a vector of floats."""
+    as_float = context.cast(builder, number, source, types.float64)
+    return _repeat(builder, as_float, _LLVM_KINDS["f8"])
+
+
+lower_cast(types.Float, FLOATS)(_cast_number)
+lower_cast(types.Integer, FLOATS)(_cast_number)
+
+
+def _is_number(numba_type: Any) -> bool:
+    return isinstance(numba_type, types.Float | types.Integer)
+
+
+def _define_binary(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
+    """Defines an operation on two vectors of floats, or on one of them and a number."""
+
+    @infer_global(function)
+    class _Template(AbstractTemplate):
+        def generic(self, args: Any, _keywords: Any) -> Any:
+            if len(args) != 2 or FLOATS not in args:
+                return None
+            if all(kind == FLOATS or _is_number(kind) for kind in args):
+                return signature(result, FLOATS, FLOATS)
+            return None
+
+    lower_builtin(function, FLOATS, FLOATS)(
+        lambda _context, builder, _signature, args: generate(builder, *args)
+    )
+
+
+def _define_unary(function: Any, generate: Callable[..., Any]) -> None:
+    """Defines an operation on a vector of floats."""
+
+    @infer_global(function)
+    class _Template(AbstractTemplate):
+        def generic(self, args: Any, _keywords: Any) -> Any:
+            return signature(FLOATS, FLOATS) if args == (FLOATS,) else None
+
+    lower_builtin(function, FLOATS)(
+        lambda _context, builder, _signature, args: generate(builder, args[0])
+    )
+
+
+def _call_llvm(name: str) -> Callable[..., Any]:
+    """Returns a generator of the call of a function of LLVM."""
+
+    def generate(builder: Any, number: Any) -> Any:
+        floats = _LLVM_KINDS["f8"]
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(floats, [floats]), f"{name}.v{GROUP}f64"
+        )
+        return builder.call(function, [number])
+
+    return generate
+
+
+def _compare(symbol: str) -> Callable[..., Any]:
+    """Returns a generator of a comparison, which is false for NaN."""
+    return lambda builder, a, b: builder.fcmp_ordered(symbol, a, b)
+
+
+def _least(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", b, a), b, a)
+
+
+def _largest(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", b, a), b, a)
+
+
+for _operators, _name in (
+    ((operator.add, operator.iadd), "fadd"),
+    ((operator.sub, operator.isub), "fsub"),
+    ((operator.mul, operator.imul), "fmul"),
+    ((operator.truediv, operator.itruediv), "fdiv"),
+):
+    for _operator in _operators:
+        _define_binary(
+            _operator, FLOATS, lambda builder, a, b, name=_name: getattr(builder, name)(a, b)
+        )
+for _operator, _symbol in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+):
+    _define_binary(_operator, CONDITIONS, _compare(_symbol))
+_define_binary(
+    operator.ne, CONDITIONS, lambda builder, a, b: builder.fcmp_unordered("!=", a, b)
+)
+# As Numba's `min` and `max` of two numbers.
+_define_binary(min, FLOATS, _least)
+_define_binary(max, FLOATS, _largest)
+_define_unary(operator.neg, lambda builder, a: builder.fneg(a))
+_define_unary(abs, _call_llvm("llvm.fabs"))
+_define_unary(math.sqrt, _call_llvm("llvm.sqrt"))
+_define_unary(np.floor, _call_llvm("llvm.floor"))
+
+
+def _define_integers(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
+    """Defines an operation on a vector of integers and an integer."""
+
+    @infer_global(function)
+    class _Template(AbstractTemplate):
+        def generic(self, args: Any, _keywords: Any) -> Any:
+            if len(args) == 2 and args[0] == INTEGERS and isinstance(args[1], types.Integer):
+                return signature(result, INTEGERS, types.int64)
+            return None
+
+    def lower(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return generate(builder, args[0], _repeat(builder, args[1], _LLVM_KINDS["i8"]))
+
+    lower_builtin(function, INTEGERS, types.int64)(lower)
+
+
+_define_integers(operator.add, INTEGERS, lambda builder, a, b: builder.add(a, b))
+_define_integers(operator.and_, INTEGERS, lambda builder, a, b: builder.and_(a, b))
+_define_integers(operator.ne, CONDITIONS, lambda builder, a, b: builder.icmp_signed("!=", a, b))
+
+
+@intrinsic
+def _select(_context: Any, condition: Any, if_true: Any, if_false: Any) -> Any:
+    """Generates the choice between two vectors of floats by a vector of conditions."""
+    if condition != CONDITIONS:
+        return None
+    if not all(kind == FLOATS or _is_number(kind) for kind in (if_true, if_false)):
+        return None
+
+    def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.select(*args)
+
+    return FLOATS(CONDITIONS, FLOATS, FLOATS), generate
+
+
+@intrinsic
+def _truncate(_context: Any, number: Any) -> Any:
+    """Generates the conversion of floats to integers."""
+
+    def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.fptosi(args[0], _LLVM_KINDS["i8"])
+
+    return (INTEGERS(FLOATS), generate) if number == FLOATS else None
+
+
+select_vector: Any = _select
+truncate_vector: Any = _truncate
+
+
+def _choose_vector(condition: Any, if_true: Any, if_false: Any) -> Any:
+    """Form of `choose` for vectors."""
+    return select_vector(condition, if_true, if_false)
+
+
+def _whole_vector(number: Any) -> Any:
+    """Form of `whole` for vectors."""
+    return truncate_vector(number)
+
+
+set_lane_form(choose, lambda _types: _choose_vector)
+
+
+def _round_vector_down(number: Any) -> Any:
+    """Form of `round_down` for vectors."""
+    return np.floor(number)
+
+
+set_lane_form(round_down, lambda _types: _round_vector_down)
+set_lane_form(whole, lambda _types: _whole_vector)
+
+
+class _GroupType(types.Type):
+    """Type of rows of a table in eight lanes, a pointer to the first number."""
+
+    in_lanes = True
+
+    def __init__(self, table: Any, constants: tuple[Constants, ...]) -> None:
+        self.fields: tuple[LaneField, ...] = table.fields
+        self.row_length: int = table.row_length
+        self.constants = constants
+        name = f"{type(self).__name__}({self.fields}, {constants}, {LANES}, {GROUP})"
+        super().__init__(name)
+
+    @property
+    def mangling_args(self) -> tuple[str, tuple[str]]:
+        """Name of the type in symbols of machine code."""
+        digest = hashlib.sha256(self.name.encode()).hexdigest()
+        return type(self).__name__, (f"g{digest[:16]}",)
+
+
+class RowsInGroup(_GroupType):
+    """Type of all rows of a table in eight lanes."""
+
+
+class RowInGroup(_GroupType):
+    """Type of one row of a table in eight lanes."""
+
+    def find_field(self, name: str) -> LaneField | None:
+        """Returns the field of a name, or None."""
+        return next((field for field in self.fields if field.name == name), None)
+
+    def find_constant(self, name: str) -> int | None:
+        """Returns the value of a field that is equal in all lanes, or None."""
+        return dict(self.constants[0]).get(name)
+
+
+@register_model(RowsInGroup)
+@register_model(RowInGroup)
+class _GroupModel(models.PrimitiveModel):
+    """Rows in a group are represented by a pointer."""
+
+    def __init__(self, manager: Any, numba_type: Any) -> None:
+        super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
+
+
+def _vector_of(field: LaneField) -> LaneVector:
+    """Returns the type of a number of a field."""
+    return FLOATS if field.kind == "f8" else INTEGERS
+
+
+@infer_getattr
+class _RowAttributes(AttributeTemplate):
+    """Types of the fields of a row in a group."""
+
+    key = RowInGroup
+
+    def generic_resolve(self, row: RowInGroup, name: str) -> Any:
+        if row.find_constant(name) is not None:
+            return types.int64
+        field = row.find_field(name)
+        if field is None:
+            return None
+        vector = _vector_of(field)
+        if not field.shape:
+            return vector
+        return types.Array(vector, len(field.shape), "A", aligned=False)
+
+
+@infer_getattr
+class _RowsAttributes(AttributeTemplate):
+    """Rows in a group have the shape (count,)."""
+
+    key = RowsInGroup
+
+    def resolve_shape(self, _rows: RowsInGroup) -> Any:
+        return types.UniTuple(types.intp, 1)
+
+
+def _find_numbers(builder: Any, pointer: Any, field: LaneField) -> Any:
+    """Generates the address of the first vector of a field."""
+    numbers = offset_rows(builder, pointer, field.first_word)
+    return builder.bitcast(numbers, _LLVM_KINDS[_vector_of(field).kind].as_pointer())
+
+
+@lower_getattr_generic(RowInGroup)
+def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name: str) -> Any:
+    """Generates the reading of a field: a constant, a vector, or a view of an array."""
+    constant = row_type.find_constant(name)
+    if constant is not None:
+        return context.get_constant(types.int64, constant)
+    field = row_type.find_field(name)
+    assert field is not None
+    data = _find_numbers(builder, row, field)
+    if not field.shape:
+        return builder.load(data, align=_WORD)
+
+    array_type = types.Array(_vector_of(field), len(field.shape), "A", aligned=False)
+    view = context.make_array(array_type)(context, builder)
+    strides: list[int] = []
+    step = LANES * _WORD  # from one number of a run to the next
+    for length in reversed(field.shape):
+        strides.insert(0, step)
+        step *= length
+
+    def pack(numbers: Any) -> Any:
+        constants = [context.get_constant(types.intp, number) for number in numbers]
+        return cgutils.pack_array(builder, constants)
+
+    arrayobj.populate_array(
+        view,
+        data=data,
+        shape=pack(field.shape),
+        strides=pack(strides),
+        itemsize=context.get_constant(types.intp, GROUP * _WORD),
+        meminfo=None,
+    )
+    return view._getvalue()
+
+
+@lower_setattr_generic(RowInGroup)
+def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
+    """Generates the writing of a vector."""
+    row_type, value_type = sig.args
+    field = row_type.find_field(name)
+    value = context.cast(builder, args[1], value_type, _vector_of(field))
+    builder.store(value, _find_numbers(builder, args[0], field), align=_WORD)
+
+
+@lower_getattr_generic(RowsInGroup)
+def _read_shape(context: Any, builder: Any, rows: RowsInGroup, _value: Any, _name: str) -> Any:
+    """Generates the shape of rows in a group, which is a constant."""
+    count = context.get_constant(types.intp, len(rows.constants))
+    return context.make_tuple(builder, types.UniTuple(types.intp, 1), [count])
+
+
+@infer_global(operator.getitem)
+class _RowsItem(AbstractTemplate):
+    """The type of `rows[index]`, if all rows have the same constants."""
+
+    def generic(self, args: Any, _keywords: Any) -> Any:
+        rows, index = args
+        if not isinstance(rows, RowsInGroup) or not isinstance(index, types.Integer):
+            return None
+        if len(set(rows.constants)) > 1:
+            return None
+        return signature(RowInGroup(rows, rows.constants[:1]), rows, types.intp)
+
+
+@lower_builtin(operator.getitem, RowsInGroup, types.Integer)
+def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Generates `rows[index]`."""
+    row_bytes = ir.Constant(args[1].type, sig.args[0].row_length * LANES * _WORD)
+    offset = builder.mul(args[1], row_bytes)
+    return builder.gep(args[0], [offset], source_etype=ir.IntType(8))
+
+
+@intrinsic
+def _in_group(_context: Any, table: Any, _group: Any) -> Any:
+    """Generates the rows of a table in eight lanes."""
+    assert isinstance(table, LaneTable)
+    rows_type = RowsInGroup(table, table.constants)
+
+    def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        offset = builder.mul(args[1], ir.Constant(args[1].type, GROUP * _WORD))
+        return builder.gep(args[0], [offset], source_etype=ir.IntType(8))
+
+    return rows_type(table, types.intp), generate
+
+
+in_group: Any = _in_group
+"""Returns the rows of a table in lanes 8 g to 8 g + 7: `in_group(table, g)`."""

@@ -1,0 +1,228 @@
+"""Advances a run and its twins side by side in lanes.
+
+A twin is a repetition of a run that receives a small push. All of them receive the same samples
+at the same ticks, which are therefore determined only once.
+
+Invariant:
+    - The states and the records are those of `FusedRun`, bit for bit, as long as no arm leaves
+      its limits.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.step.fused_run import ReplayedInputs
+from ...core.step.jit import is_lane_code_stored
+from ...core.step.ticks import NS_PER_S, first_tick_at
+from ...core.step.vectors import Array, IntArray
+from ..fused import FusedRun, mark_floats, scale_differences
+from .lane_deliveries import use_recorded_samples
+from .lane_rows import LANES, Words
+from .lane_run import LaneRun, choose_code, find_layout, list_argument_types
+from .lane_structure import find_obstacle, find_structure
+from .run_groups import LEAST_RUNS
+
+
+class LaneEndedError(Exception):
+    """A run in lanes cannot continue, because an arm left its limits or a law failed."""
+
+
+def has_lane_code(run: FusedRun) -> bool:
+    """Returns True if the code for a run in lanes exists already.
+
+    Args:
+        run: The run. There must be no obstacle, see `find_obstacle`.
+    """
+    structure = find_structure(run)
+    layout = find_layout(run)
+    return all(
+        is_lane_code_stored(choose_code(layout), list_argument_types(layout, structure, site))
+        for site in structure.sites
+    )
+
+
+def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> bool:
+    """Returns True if a run and its twins are to be computed in lanes.
+
+    Args:
+        run: The run before its first tick.
+        runs: Number of runs, the twins included.
+        ticks: Number of ticks of each site.
+        least_site_ticks: Number of site ticks for which the code is worth its compilation.
+    """
+    if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
+        return False
+    site_ticks = runs * ticks * len(run.scenario.names)
+    return site_ticks >= least_site_ticks or has_lane_code(run)
+
+
+class TwinLanes(LaneRun):
+    """A run and its twins in lanes. The run is in lane 0.
+
+    Args:
+        run: The run before its first tick, which does not advance. See `suits_twins`.
+        count: Number of runs, the twins included.
+        ticks: Number of ticks of each site in the whole run.
+        feed: Inputs of a recorded run that is repeated.
+        kept: Number of records of each site that are kept between two calls of `step_to`.
+    """
+
+    def __init__(
+        self, run: FusedRun, count: int, ticks: int, feed: ReplayedInputs, kept: int
+    ) -> None:
+        super().__init__([run], 1 << kept.bit_length())
+        self._count = count
+        self._feed = feed
+        # The run and its twins have the same initial state, which all lanes contain already.
+        self.runs = [run] * count
+        self._states[:] = self._states[:, :, :1]
+        run.plan([ticks] * self._sites)
+        self._widen_peaks(run.memory.peaks.shape[1])
+        self._planned_ticks = ticks
+        self._last_ticks = 0
+        floats: list[tuple[Words, NDArray[np.bool_]]] = [
+            (self._site, mark_floats(self._layout.site)),
+            (self._links, mark_floats(self._layout.link)),
+        ]
+        of_laws = (self._laws, self._sent, self._received)
+        floats += [(words, np.full(words.shape[1], True)) for words in of_laws]
+        self._changing = floats
+
+    def step_to(self, last_ns: int) -> None:
+        """Executes all planned ticks of the run and its twins up to a time.
+
+        Args:
+            last_ns: Time of the last tick to be executed, ns since the epoch.
+
+        Raises:
+            LaneEndedError: An arm left its limits, or a law failed.
+        """
+        self._last_ticks = self._ticks
+        ticks = min(first_tick_at(last_ns + 1, self._rate_hz), self._planned_ticks)
+        try:
+            self._step_to(ticks)
+        except Exception as error:  # a law may raise any exception
+            raise LaneEndedError from error
+        if (self._ended.ticks[: self._count] >= 0).any():
+            raise LaneEndedError
+
+    def _use_samples(self, first: int, count: int) -> int:
+        """Finds the samples that all runs use in a block of ticks."""
+        if self._feed.first.shape[2] == 0:
+            age = super()._use_samples(first, count)
+        else:
+            tables = self.runs[0].memory.tables
+            age = use_recorded_samples(
+                first=first,
+                count=count,
+                rate_hz=self._rate_hz,
+                feed=self._feed,
+                links=tables.links,
+                models=tables.models,
+                dues=tables.dues,
+                calendars=tables.calendars,
+                points=tables.points,
+                channel=tables.channel,
+                state=self._states[0, 0, 0],
+                used=self._used,
+            )
+        # Whole vector registers.
+        lanes = -(-self._count // 8) * 8
+        self._used[:, :, 1:lanes] = self._used[:, :, :1]
+        return age
+
+    def read_times(self) -> IntArray:
+        """Returns the nominal times of the ticks of the last call of `step_to`, ns."""
+        # The equation of `tick_ns`.
+        return np.arange(self._last_ticks, self._ticks) * NS_PER_S // self._rate_hz
+
+    def read_records(self, i: int, columns: slice, runs: slice) -> Array:
+        """Returns numbers of the records of the last call of `step_to`.
+
+        Args:
+            i: Index of the site.
+            columns: Columns of the records, see `Layout.columns`.
+            runs: The runs.
+
+        Returns:
+            The numbers, shape (ticks, columns, runs).
+        """
+        pages = np.arange(self._last_ticks, self._ticks) % self._records.shape[1]
+        records: Array = self._records[i, :, columns, runs].view(np.float64)[pages]
+        return records
+
+
+class LaneTwin:
+    """One run in the lanes of a run and its twins, with the methods of `FusedRun` for twins.
+
+    Args:
+        lanes: The run and its twins.
+        lane: Lane of this run.
+    """
+
+    has_programs = False
+    diverged_s = None
+
+    def __init__(self, lanes: TwinLanes, lane: int) -> None:
+        self._lanes = lanes
+        self._lane = lane
+
+    def copy_state(self, other: "LaneTwin") -> None:
+        """Makes this run continue from exactly the same state as another run."""
+        self.scale_difference(other, 0.0)
+
+    def scale_difference(self, other: "LaneTwin", factor: float) -> None:
+        """Multiplies the difference between the states of this run and another run by a factor.
+
+        See `FusedRun.scale_difference`.
+
+        Args:
+            other: The other run in the lanes.
+            factor: The factor.
+        """
+        lanes = self._lanes
+        for words, is_float in lanes._changing:
+            floats = np.broadcast_to(is_float, words.shape[:2])
+            _scale(words[:, :, self._lane], words[:, :, other._lane], floats, factor)
+        states = lanes._states.view(np.int64)
+        mine = states[:, :, self._lane]
+        _scale(mine, states[:, :, other._lane], np.full(mine.shape, True), factor)
+
+    def displace(self, field: str, offsets: Array) -> None:
+        """Adds offsets to one field of the state of all sites, see `FusedRun.displace`."""
+        columns = self._find_columns(field)
+        words = slice(columns.start, columns.start + offsets.shape[1])
+        self._lanes._site.view(np.float64)[:, words, self._lane] += offsets
+
+    def measure_distance(self, other: "LaneTwin", field: str) -> float:
+        """Returns the largest difference of a field, see `FusedRun.measure_distance`."""
+        numbers = self._lanes._site.view(np.float64)[:, self._find_columns(field)]
+        difference = numbers[:, :, self._lane] - numbers[:, :, other._lane]
+        return float(np.abs(difference).max())
+
+    def _find_columns(self, field: str) -> slice:
+        """Returns the words of a field in the row of a site."""
+        fields: Any = self._lanes._layout.site.fields
+        dtype, offset, *_ = fields[field]
+        return slice(offset // 8, (offset + dtype.itemsize) // 8)
+
+
+def _scale(mine: Words, others: Words, is_float: NDArray[np.bool_], factor: float) -> None:
+    """Multiplies the differences between numbers of two runs by a factor.
+
+    Args:
+        mine: Numbers of a run, as words; changed.
+        others: The same numbers of the other run.
+        is_float: Which of them are floating-point numbers. All others are copied.
+        factor: The factor.
+    """
+    bits = mine.copy()
+    mine[:] = others
+    if factor == 0.0:
+        return
+    changed = (bits != others) & is_float
+    x = bits[changed].view(np.float64)
+    y = others[changed].view(np.float64)
+    mine[changed] = scale_differences(x, y, factor).view(np.int64)
