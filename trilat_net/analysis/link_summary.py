@@ -555,7 +555,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Computes mean, standard deviation, percentiles and extremes of some numbers.
+    """Computes mean, standard deviation, percentiles and extremes, for example of the ages.
 
     Args:
         values: The numbers.

@@ -79,7 +79,10 @@ class RunView:
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
-        """The sites with records, by name."""
+        """The sites with records, by name.
+
+        Metrics of the other sites have a reason in place of a value.
+        """
         runs = {}
         for site, records in align_records(self.log).items():
             runs[site] = SiteRun(
@@ -104,7 +107,7 @@ class RunView:
 
     @cached_property
     def absent(self) -> list[str]:
-        """Names of the sites without records."""
+        """Names of the sites without any record, which a log of a failed session may have."""
         return [site for site in self.log.sites if site not in self.sites]
 
     @cached_property

@@ -153,7 +153,7 @@ class RunFindings(NamedTuple):
 
     @property
     def has_pushes(self) -> bool:
-        """True if twins of the run exist."""
+        """True if the run was repeated with small pushes (twins)."""
         return self.twins is not None and bool(self.twins.pushes)
 
     @property

@@ -62,7 +62,7 @@ class SessionScenario(Protocol):
         """
 
     def ticks(self, site: str) -> int:
-        """Returns how many ticks a site executes in the whole run.
+        """Returns how many ticks a site executes in the whole run, from duration and tick rate.
 
         Args:
             site: Name of the site.

@@ -95,7 +95,11 @@ class NamedCode(Protocol):
 
 
 class SiteWithCode(Protocol):
-    """Interface of a site of a scenario whose parts may be classes of users."""
+    """Interface of a site of a scenario whose parts may be classes of users.
+
+    These parts are its control law, its operators and its plant. The checks of permissions look
+    for users' classes here, without importing the types of scenarios.
+    """
 
     @property
     def control(self) -> Any:

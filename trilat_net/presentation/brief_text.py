@@ -59,6 +59,8 @@ _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
 def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
     """Yields the judgement of a certificate and its most important reasons.
 
+    `trilat certify` prints these lines, unless --all asks for all of them.
+
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """

@@ -146,7 +146,7 @@ def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
 
 
 def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
-    """Renders a bar for each slave whose dominance factors change.
+    """Renders a bar for each slave whose dominance factors change, with an area for each peer.
 
     Args:
         log: Log of the run.

@@ -63,6 +63,8 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
 def summarise_origin(log: Log) -> str:
     """Returns the name, length and origin of a run in one line, for the head of the page.
 
+    The origin is, for example, a live session or virtual time.
+
     Args:
         log: Log of the run.
     """

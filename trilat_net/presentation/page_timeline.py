@@ -73,7 +73,7 @@ class _RunMoment(NamedTuple):
 
 
 def render_timeline(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with what happened, in the order of time.
+    """Renders the section with what happened during the run, in the order of time.
 
     Args:
         log: Log of the run.

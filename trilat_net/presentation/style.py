@@ -470,7 +470,7 @@ def typeset(text: str) -> str:
 
 
 def typeset_unit(unit: str) -> str:
-    """Replaces "^2" in a unit by the sign ².
+    """Replaces "^2" in a unit by the sign ²: "rad/s^2" becomes "rad/s²".
 
     Args:
         unit: The unit, such as "rad/s^2".

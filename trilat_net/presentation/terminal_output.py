@@ -92,7 +92,7 @@ def print_note(text: object) -> None:
 
 
 def print_error(text: object) -> None:
-    """Prints an error message to standard error.
+    """Prints an error message to standard error, so that it does not disturb results.
 
     Args:
         text: The message.

@@ -110,7 +110,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def theta(self) -> Array:
-        """The arm's true parameters, shape (P,)."""
+        """The arm's true parameters, which combine masses, inertias and lengths, shape (P,).
+
+        V measures how far the estimates are from them.
+        """
         return self.arm.theta
 
     @property
@@ -528,7 +531,10 @@ class FunctionalParts(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """V_i, shape (K,), in J."""
+        """Energy V_i of the site in the stability proof: the sum of its parts, in J.
+
+        The shape is (K,), with one entry per record.
+        """
         return self.kinetic + self.parameter + self.position + self.delay
 
 

@@ -128,7 +128,10 @@ class Premise(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The evidence, as a sentence."""
+        """What the log shows about the premise, as a sentence for people.
+
+        `premise_text` has a function for each class of quantities that composes this sentence.
+        """
         return DESCRIBERS[type(self.quantities)](self.quantities)
 
     def to_json(self) -> JsonObject:

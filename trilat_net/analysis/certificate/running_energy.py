@@ -174,7 +174,7 @@ class RecordWindow:
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """Returns True if the stored records contain the record of a tick.
+        """Returns True if the record of a tick has arrived, and is still in the window.
 
         Args:
             tick: Number of the tick, a period of the control loop.

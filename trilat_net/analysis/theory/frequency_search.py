@@ -68,7 +68,11 @@ class Minima(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least value of the curve."""
+        """The least value of the curve over all frequencies.
+
+        For an eigenvalue that must be positive, it is the margin, or a violation if it is
+        negative.
+        """
         return float(self.values.min())
 
     @property

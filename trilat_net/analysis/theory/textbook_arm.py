@@ -306,7 +306,10 @@ class PlacedChain:
         return self.required_torque(theta, zeros, zeros, zeros)
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), including the drives, shape (n, n, ...).
+        """Returns the inertia matrix M(q), which maps joint accelerations to torques.
+
+        It includes the inertia of the drives. The shape is (n, n, ...), with one matrix for
+        each set of joint angles.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).

@@ -810,6 +810,8 @@ class PushedTwins(Result):
     def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence for the user on whether the effect of a push grows or dies away.
 
+        The sentence names the push, such as its joint and size, and the rate.
+
         Args:
             pushed: The push and its effect.
         """

@@ -276,7 +276,7 @@ class _PackageCommand(TyperCommand):
 
     @_deferred
     def help(self) -> Any:
-        """The help of the imported command."""
+        """The help of the command. Reading it imports the package."""
         return self._command.help
 
     @_deferred

@@ -153,7 +153,9 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Adds the lateness of one published message to the histogram.
+        """Counts the lateness of one published message.
+
+        The method is called for every message, and must therefore be fast.
 
         Args:
             late_ns: Time from the deadline of the message to its publication, in ns.

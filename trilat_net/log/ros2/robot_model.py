@@ -66,7 +66,7 @@ class _JointFrame(NamedTuple):
     q_index: int
 
     def compute_transform(self, position: float) -> Transform:
-        """Computes the pose of the link's frame in the parent link's frame.
+        """Computes the pose of the link relative to its parent, for a position of the joint.
 
         Args:
             position: Position of the joint, in rad or m.

@@ -316,7 +316,7 @@ class Ros2SiteChannels:
         return channels
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
-        """Returns a channel of joint states.
+        """Returns a channel of joint states, the usual message with the joints of a robot.
 
         Args:
             names: Names of the joints.
