@@ -78,7 +78,10 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
-    """Solves the linear systems A y = b, one for each entry of the trailing axes.
+    """Solves the linear systems A y = b, separately for each of many records.
+
+    The records are counted by the last axes, while NumPy's solver expects them in the first
+    ones.
 
     Args:
         A: Square matrices, shape (m, m, ...).
@@ -120,7 +123,9 @@ class PlacedArm:
     q: Numbers
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), shape (2, 2, ...), in kg m^2.
+        """Returns the inertia matrix M(q), which maps accelerations to torques, in kg m^2.
+
+        The shape is (2, 2, ...), with one matrix per record.
 
         Args:
             theta: The five dynamic parameters of the arm, which combine masses, lengths and
@@ -432,7 +437,7 @@ class PlanarArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) that holds the arm against gravity, in N m.
+        """Returns the torque G(q) that holds the arm against gravity in K poses, in N m.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.

@@ -256,6 +256,8 @@ class TaskFollowing:
     def project_torque(self, torque: Array) -> Array:
         """Returns the force at the end effector that corresponds to a joint torque, in N.
 
+        `compute_joint_torque` is the reverse conversion.
+
         Args:
             torque: Joint torque, shape (K, n), in N m.
 

@@ -744,7 +744,7 @@ class DelayDistribution(NamedTuple):
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Collects the delays and ages of the samples on every link of a run.
+    """Collects the delays and ages of the samples on every link of a run, for histograms.
 
     Args:
         log: Log of the run.

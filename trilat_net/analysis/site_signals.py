@@ -106,6 +106,8 @@ def find_largest_error(part: SiteLog, from_s: float = -math.inf) -> JointError |
 def find_error_of_last_second(part: SiteLog) -> JointError | None:
     """Finds the largest error |e| of a site in the last second of its records.
 
+    The last second, rather than the last record, does not miss an oscillation.
+
     Args:
         part: Log of the site.
 

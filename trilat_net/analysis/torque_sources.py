@@ -326,7 +326,7 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     end_effector = arm.place_end_effector(records.q, records.qd)
 
     def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
-        """Returns the sum of the torques of some operators or environments, in N m.
+        """Returns the sum of the torques that the models of operators or environments give.
 
         Args:
             sources: The operators or environments.

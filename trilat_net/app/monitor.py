@@ -254,6 +254,8 @@ class SessionDisplay:
     ) -> None:
         """Shows the present state of the session: a table of the sites, and alarms above it.
 
+        An alarm remains visible as long as it is present.
+
         Args:
             title: Title of the table.
             rows: Rows of the sites.

@@ -332,7 +332,7 @@ def ping_topic(
     lasts_s: float,
     stopped: Callable[[], bool],
 ) -> TopicDelays:
-    """Measures the delays of the messages on a ROS 2 topic.
+    """Measures the delays of a ROS 2 topic, from the sending time that each message carries.
 
     Args:
         graph: Connection to the ROS 2 programs.

@@ -63,6 +63,8 @@ class Finding:
     def add(self, file: str, offset: int | None, text: str) -> None:
         """Adds a problem to the check, which has therefore not passed.
 
+        Only the first `_MAX_LISTED_PROBLEMS` problems are stored. All are counted.
+
         Args:
             file: Name of the file in which the problem was found.
             offset: Place of the problem in the file, in bytes. None if it concerns the whole

@@ -270,6 +270,8 @@ class LogFile:
     def write(self, data: bytes, /) -> int:
         """Stores bytes in memory. The next `flush` writes them to the file.
 
+        A slow disk therefore cannot stop the caller while messages arrive.
+
         Args:
             data: The bytes.
 

@@ -754,6 +754,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
         """Lists the changes that a site applied, decoded so that the run can be executed again.
 
+        `changes` returns the same changes as JSON texts.
+
         Args:
             site: Name of the site.
 

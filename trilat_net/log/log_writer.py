@@ -599,7 +599,7 @@ class LogParts:
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last part, so that the log is finished.
+        """Completes the last part, so that the log is finished and gets its final name.
 
         Args:
             accounts: Numbers of received and missing messages as a string, by topic, and other

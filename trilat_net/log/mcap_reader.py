@@ -511,7 +511,7 @@ class ChannelMessages:
     publish_ns: "array[int]" = field(default_factory=partial(array, "Q"))
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Adds the next message of the topic.
+        """Adds the next message of the topic, in the order of the file.
 
         Args:
             payload: The message, encoded as published.

@@ -365,7 +365,7 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads bytes of the file.
+        """Reads bytes of the file, but never beyond its end.
 
         Args:
             offset: Offset of the first byte in the file.
@@ -605,6 +605,8 @@ def has_right_crc(attachment: bytes) -> bool:
 
 def parse_record(opcode: int, content: bytes) -> Any:
     """Decodes the content of a record with the `mcap` package.
+
+    The package raises various errors for damaged content. Here they become a single kind.
 
     Args:
         opcode: Number of the kind of record, which must be in `KINDS`.

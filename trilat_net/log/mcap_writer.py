@@ -207,7 +207,7 @@ class McapWriter:
         return (last_ns - first_ns) * 1e-9
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Writes a schema to the file, which describes the fields of messages.
+        """Writes a schema to the file, so that other programs can decode the messages.
 
         Args:
             name: Name of the schema.
@@ -258,6 +258,8 @@ class McapWriter:
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
         """Adds a message to the open chunk, and writes the chunk if it is large enough.
+
+        Messages of a chunk are compressed together, which makes the file much smaller.
 
         Args:
             channel_id: Number of the channel, from `register_channel`.

@@ -418,7 +418,7 @@ class SiteLog:
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
-        """Returns an integer field of all records.
+        """Returns an integer field of all records as an array, for example "busy_us".
 
         Args:
             field: Name of the field in a record, see `State`.
@@ -455,7 +455,7 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record, without decoding the others.
+        """Decodes a single record, without decoding the others, which is fast for a long log.
 
         Args:
             n: Index of the record in the order of ticks. -1 is the last record.

@@ -73,7 +73,7 @@ REPORT_SIZE = FigureSize(width_in=PAGE_IN, tick_pt=7.0, small_pt=6.0, dpi=200)
 
 
 def make_print_size(width_in: float) -> FigureSize:
-    """Returns the size of a figure for a paper, with type of 8 pt.
+    """Returns the size of a figure that fits a column or the page of a paper, with 8 pt type.
 
     Args:
         width_in: Width in inches: 3.5 for one column, or 7 for two columns.

@@ -47,6 +47,8 @@ def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Mark
 def render_folds(folds: Iterable[Markup]) -> Markup:
     """Renders parts that unfold, side by side while they are folded.
 
+    Details that few readers need take one line in this way.
+
     Args:
         folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
     """
@@ -101,6 +103,8 @@ def render_legend(columns: Mapping[str, str]) -> Markup:
 
 def render_scrolling(content: Markup, label: str) -> Markup:
     """Renders HTML in a region that scrolls sideways, also by the keyboard.
+
+    The page itself then never becomes wider than the screen.
 
     Args:
         content: HTML of the content of the region.

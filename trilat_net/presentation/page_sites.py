@@ -45,7 +45,7 @@ _ANGLE_COLUMNS = {
 
 
 def render_sites(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with the records and the motion of each site.
+    """Renders the section with the records and the motion of each site, as tables.
 
     Args:
         log: Log of the run.

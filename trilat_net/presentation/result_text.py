@@ -252,6 +252,8 @@ _BRIEF_COMPOSERS = {
 def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
     """Collects the blocks of a result's text: lines and tables.
 
+    Terminal, plain text and HTML all render these blocks.
+
     Args:
         result: What a command has computed, such as the measured numbers of a run.
         brief: True for the ten most important lines of a certificate, of metrics or of a

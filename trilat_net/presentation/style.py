@@ -138,7 +138,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels to a figure.
+    """Adds a grid of panels, parts of the figure with axes of their own.
 
     Args:
         figure: The Matplotlib figure.
@@ -332,7 +332,7 @@ def name_shared(log: Log) -> list[str]:
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes titles above a row of panels, one for each joint.
+    """Writes a title, such as the joint's name, above each panel of a row.
 
     Args:
         log: Log with the joints.
@@ -479,7 +479,7 @@ def typeset_unit(unit: str) -> str:
 
 
 def typeset_symbol(parameter: str) -> str:
-    """Returns the symbol of an inertial parameter, with its index as a subscript.
+    """Returns the symbol of an inertial parameter for Matplotlib, with its index below.
 
     Args:
         parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
@@ -566,7 +566,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes the reason why a panel is empty into the panel.
+    """Writes into an empty panel why there is nothing to show.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -592,7 +592,7 @@ _UNDATED: dict[str, dict[str, Any]] = {
 
 
 def write_figure(figure: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure to a file.
+    """Writes a figure to a file, in the format that the suffix of the file names.
 
     Args:
         figure: The Matplotlib figure.
@@ -746,7 +746,7 @@ class TimeFigure:
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
     ) -> None:
-        """Draws a line over time with one value for each record of a site.
+        """Draws a line over time with a value for each record of a site, in the site's colour.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.

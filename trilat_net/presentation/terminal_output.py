@@ -170,6 +170,8 @@ def print_table(table: "TextTable") -> None:
 def print_result(result: "Result", *, as_json: bool = False, brief: bool = False) -> None:
     """Prints the result of a command, as text for people or as JSON for programs.
 
+    All commands with results end with this call, so that their output is uniform.
+
     Args:
         result: The result of a command.
         as_json: True to print the values as JSON.

@@ -568,7 +568,7 @@ class ScenarioDifference(NamedTuple):
 
 
 def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the keys in which several experiments differ.
+    """Finds the keys in which several experiments differ, including keys that only some have.
 
     Args:
         scenarios: Descriptions of at least two experiments.

@@ -221,6 +221,8 @@ def check_keys(
 ) -> TomlTable:
     """Checks that a value of a scenario is a table that contains only valid keys.
 
+    The error suggests the key that the author may have meant.
+
     Args:
         table: A value of a scenario.
         valid: The keys that the table may have.

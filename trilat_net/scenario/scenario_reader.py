@@ -174,7 +174,7 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Checks and completes the description of an experiment.
+        """Checks and completes the description of an experiment, after overrides of its keys.
 
         Args:
             overrides: Texts KEY=VALUE, each of which replaces one value of the description. By
@@ -288,7 +288,7 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Converts a TOML text to a checked scenario.
+    """Converts a TOML text to a checked scenario, in which every key has a value.
 
     Args:
         text: TOML text of a scenario file.

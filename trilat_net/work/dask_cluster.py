@@ -146,6 +146,9 @@ def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
     """Returns the laws whose file this process does not have, or has with other contents.
 
+    A worker without the file of a user's law could not run the study, or would compute other
+    results.
+
     Args:
         laws: Name of each law, with the SHA-256 of its file.
     """

@@ -181,6 +181,8 @@ class _Feed(Generic[T]):
     def add_timing(self, runs: int, wall_s: float) -> None:
         """Updates the mean duration of an item, from which the size of later batches follows.
 
+        Short items are sent in large batches, because sending takes time as well.
+
         Args:
             runs: Number of finished items.
             wall_s: Duration of all of them together, in s.
@@ -227,7 +229,7 @@ class _Feed(Generic[T]):
         return batch
 
     def return_lost(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
-        """Puts the items of a batch whose worker died back into the queue.
+        """Puts the items of a batch whose worker died back into the queue, to run them again.
 
         Args:
             batch: Batch whose worker died.

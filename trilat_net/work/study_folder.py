@@ -42,7 +42,7 @@ def format_command(*arguments: str) -> str:
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns the command line options that apply overrides of a scenario.
+    """Returns the command-line options --set that apply overrides of a scenario.
 
     Args:
         overrides: Texts KEY=VALUE, as in "link.delay_ms=100".

@@ -203,7 +203,7 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
-    """Checks the energies that the control laws of a log declare.
+    """Checks the energies that the control laws of a log declare, against the recorded motion.
 
     Args:
         log: The log of the run.

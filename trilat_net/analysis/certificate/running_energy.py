@@ -184,7 +184,9 @@ class RecordWindow:
         return bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of a span of ticks. Missing records are interpolated.
+        """Returns the records of a span of ticks as arrays, as the energy terms need them.
+
+        Missing records are interpolated, and marked.
 
         Args:
             first: First tick.

@@ -68,6 +68,8 @@ def unavailable(
 ) -> MetricValues:
     """Returns metrics without values for all quantities of a group, with a common reason.
 
+    A function that measures a group returns them if, for example, a site has no records.
+
     Args:
         group: Group of the quantities.
         why: The reason why there are no values.
@@ -151,7 +153,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of some numbers.
+    """Returns the largest absolute value of some numbers, for metrics such as the peak torque.
 
     Args:
         values: The numbers, of any shape.

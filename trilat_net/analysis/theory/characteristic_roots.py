@@ -616,7 +616,7 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Computes the rightmost roots of a continuous loop.
+    """Computes the rightmost roots of a continuous loop, which decide its stability.
 
     Args:
         loop: The loop.

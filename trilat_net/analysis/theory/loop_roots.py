@@ -151,7 +151,7 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
 
 
 def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
-    """Finds the control loop at the end of a recorded run, and the rest next to its end.
+    """Finds the control loop at the end of a recorded run, and the pose of rest near its end.
 
     Args:
         log: The log of the run.

@@ -221,6 +221,8 @@ def derive_operating_conditions(
 ) -> OperatingConditions:
     """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
 
+    They are delays, dominance factors, gains and operators, after all planned changes.
+
     Args:
         scenario: The description of the experiment.
         own_laws: True if the code of imported control laws may be executed.

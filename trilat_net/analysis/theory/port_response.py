@@ -222,7 +222,7 @@ def to_imaginary_axis(w_rad_s: Array) -> Complex:
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the name of the site to which a port or a state belongs.
+    """Returns the name of the site to which a port or a state of a linear loop belongs.
 
     Args:
         port: Name of the port or state. For "m1.tau2" the site is "m1".

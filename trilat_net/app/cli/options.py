@@ -34,6 +34,8 @@ def check_range(
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
     """Returns a function that refuses the number of an option if it is out of a range.
 
+    Typer calls the function, so that the error names the option.
+
     Args:
         low: The smallest number.
         high: The largest number.
@@ -480,7 +482,7 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Returns the scenario that the options of a command describe.
+    """Loads the scenario of a command, and applies the options that change it.
 
     Args:
         source: Name of a shipped scenario, or path of a TOML file.

@@ -179,6 +179,8 @@ class MessageBatch:
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
         """Divides the messages into pieces of limited size, without copying their payloads.
 
+        A piece is sent at once, so that its size limits the memory.
+
         Args:
             size: Approximate size of a piece, in bytes. A piece with one message may be larger.
 

@@ -210,7 +210,7 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Computes the time stamp of a record's messages.
+        """Computes the time stamp of all messages that are made from one record.
 
         Args:
             record: The record.
