@@ -167,9 +167,6 @@ class NearEnd:
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
         """Sends messages at a constant rate, and measures their round trips.
 
-        The messages have the size and the rate of a session, so that the network is loaded
-        alike.
-
         Args:
             size_bytes: Size of a message, in bytes.
             rate_hz: Rate of the messages, in 1/s.

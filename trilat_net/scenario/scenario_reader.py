@@ -78,7 +78,8 @@ def read_template() -> str:
 
     A user edits the text to describe an experiment.
 
-    >>> tn.load_scenario(tn.read_template()).names ('m1', 'm2', 's')
+    >>> tn.load_scenario(tn.read_template()).names
+    ('m1', 'm2', 's')
     """
     return (SHIPPED_FOLDER / "_template.toml").read_text(encoding="utf-8")
 

@@ -159,8 +159,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def random(self) -> bool:
         """True if the delay, the losses or the duplicates of the link are drawn at random.
 
-        Then another seed of the scenario gives another run. A link that loses no samples, or
-        all, draws nothing.
+        Then another seed of the scenario gives another run. Losses are drawn only if some
+        samples are lost, but not all.
         """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
