@@ -25,6 +25,7 @@ from . import (
     stop,
     tick,
     tls,
+    verify,
     virtual,
     writer,
 )
@@ -52,6 +53,7 @@ LONG = {
     "stalls": stalls.run,
     "stop": stop.run,
     "tls": tls.run,
+    "verify": verify.run,
     "endurance": endurance.run,
     "live": live.run,
     "page": page.run,

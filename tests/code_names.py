@@ -100,13 +100,17 @@ def _find_modules() -> dict[str, frozenset[str]]:
 
 
 def iterate_references() -> Iterator[Reference]:
-    """Yields the names in backticks in the docstrings of the program and on the pages of the documentation."""
+    """Yields the names in backticks in the docstrings of the program and on the pages of the documentation.
+
+    Blocks and formulas of pages do not count.
+    """
     for path in house.files():
         for value in iterate_docstrings(house.tree(path)):
             yield from _find_names(path, value.lineno, str(value.value))
     for path in (*sorted((house.ROOT / "docs").rglob("*.md")), house.ROOT / "README.md"):
         text = path.read_text(encoding="utf-8")
-        yield from _find_names(path, 1, re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+        prose = re.sub(r"```.*?```|\$`[^`]+`\$", "", text, flags=re.DOTALL)
+        yield from _find_names(path, 1, prose)
 
 
 def _find_names(path: Path, line: int, text: str) -> Iterator[Reference]:

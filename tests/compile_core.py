@@ -43,6 +43,7 @@ def compile_part(part: str) -> str:
     with tempfile.TemporaryDirectory() as folder:
         file = trilat_net.simulate(scenario).save(Path(folder) / "run.mcap")
         certify(trilat_net.open_log(file))
+        trilat_net.verify(file)
         if part in SHIPPED:
             for site in scenario.names:
                 warm_up(scenario, site)

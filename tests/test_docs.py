@@ -209,7 +209,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("stability.md", "left alone for 2 s or more", 2, run_end.LEAST_JUDGED_S),
     (
         "stability.md",
-        "an error |e| of 2 % of the difference",
+        "an error $`|e|`$ of 2 % of the difference",
         2,
         100 * run_end.HELD_SHARE,
     ),
@@ -250,7 +250,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ),
     ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, certificates.TORQUE_TOLERANCE),
     ("certificate.md", "`--min-coverage` (0.999)", 0.999, accounting.MIN_COVERAGE),
-    ("stability.md", "<= 0.01 rad/s in", 0.01, run_end.SETTLED_SPEED_RAD_S),
+    ("stability.md", r"\le 0.01`$ rad/s in", 0.01, run_end.SETTLED_SPEED_RAD_S),
     ("stability.md", "and a tenth of the run", 0.1, run_end.LEAST_JUDGED_SHARE),
     ("stability.md", "largest values of 50 ms", 50, 1e3 / ticks.BUCKETS_PER_S),
     (

@@ -64,6 +64,15 @@ def test_every_formula_becomes_mathml(page: str) -> None:
         converted = convert(formula.strip())
         assert converted.startswith("<math")
         assert "\\" not in converted, formula  # a command that is not known
+        # GitHub refuses these, see https://github.com/github/markup/issues/1688
+        assert not re.search(r"\\(?:operatorname|mbox|phantom)\b", formula), formula
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_no_formula_breaks_its_table(page: str) -> None:
+    """A bar would end the cell: GitHub and Zensical want the command for it, as in \\lvert x \\rvert."""
+    rows = re.findall(r"^\|.*$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert not [row for row in rows if "|" in "".join(re.findall(r"\$`([^`]+)`\$", row))]
 
 
 @pytest.mark.parametrize("page", PAGES)

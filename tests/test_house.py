@@ -48,8 +48,8 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 326,
-    "session": 297,
+    "kernel": 329,
+    "session": 296,
     "analysis": 120,
     "app": 68,
     "studies": 9,

@@ -338,18 +338,18 @@ PORTS: dict[str, Make] = {
 }
 ERRATA: dict[str, Make] = {
     "with ones rises by {} J of {} J while": lambda: rise(lyapunov(ones=True).V),
-    "M = {} kg m²": lambda: [3.0 + math.sqrt(8.0)],
-    "that is T' <= {}.": lambda: [6.0 / (6.0 + (6.0 + math.sqrt(8.0)) ** 2)],
+    "M = {}`$ kg m²": lambda: [3.0 + math.sqrt(8.0)],
+    r"that is $`\dot T \le {}`$.": lambda: [6.0 / (6.0 + (6.0 + math.sqrt(8.0)) ** 2)],
 }
 DAMPING: dict[str, Make] = {
-    "at x = 0, and {} K T for a = 1, at tan x = x = {}. So": lambda: [
+    r"$`x = 0`$, and $`{}\, K T`$ for $`a = 1`$, at $`\tan x = x = {}`$. So": lambda: [
         (asked := common_motion())[0],
         math.sqrt(asked[2]),
     ],
-    "m = {} K T² / {}, equal": lambda: common_motion()[1:],
-    "K T, grow by {}/s.": lambda: root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
-    "200 ms and d = 4 grows by {}/s": lambda: root("p_d_margin", ONE_WAY, (-0.1, 0.4))[:1],
-    "1/6 of K T is {}, 0.2172 of it {})": lambda: [2.0 / 6.0, 2.0 * common_motion()[0]],
+    r"m = {}\, K T^2 / {}`$, equal": lambda: common_motion()[1:],
+    "K T`$, grow by {}/s.": lambda: root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
+    "200 ms and $`d = 4`$ grows by {}/s": lambda: root("p_d_margin", ONE_WAY, (-0.1, 0.4))[:1],
+    "1/6 of $`K T`$ is {}, 0.2172 of it {})": lambda: [2.0 / 6.0, 2.0 * common_motion()[0]],
 }
 PORT_CONDITIONS: dict[str, Make] = {
     "slave it is {}, {} and {} N m s/rad at 20, 200": lambda: [

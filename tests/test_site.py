@@ -103,6 +103,22 @@ def test_the_list_of_scenarios_begins_with_the_paper() -> None:
     assert len(sections) == len(tn.list_shipped())
 
 
+def test_a_formula_has_the_spaces_of_tex() -> None:
+    formula = MAKE.convert_formula(r"|a| = -b \cos x", "inline")
+    assert '<mo lspace="0.15em" rspace="0.15em">cos</mo>' in formula
+    assert '<mo form="prefix">&#x02212;</mo>' in formula
+    assert formula.count('lspace="0" rspace="0">&#x0007C;</mo>') == 2
+
+
+def test_formula_keeps_punctuation_and_scrolls_if_long() -> None:
+    short, long = (
+        MAKE.typeset_in_line("+".join("a" * count), before="(", after=").") for count in (3, 30)
+    )
+    assert short.startswith('<span class="formula">(<math')
+    assert short.endswith("</math>).</span>")
+    assert long.startswith('<span class="formula long">(<math')
+
+
 @pytest.mark.long
 @needs_browser
 def test_the_site_is_whole() -> None:

@@ -5,6 +5,7 @@ zensical build --strict -f build/site/zensical.toml
 """
 
 import csv
+import html
 import inspect
 import re
 import shutil
@@ -26,6 +27,16 @@ BESIDE = ("CHANGELOG.md", "SECURITY.md", "LICENSE")
 """Pages that stand beside docs in the repository, and in it here."""
 MOST_ROWS = 250
 """Largest number of rows of a data file that its page shows."""
+LONG_FORMULA = 30
+"""Number of characters from which a formula in a line may be wider than a telephone."""
+RELATION = "<mo[^>]*>(?:&#x000(?:28|2C|3C|3D|3E);|&#x0226[45];|[(,])</mo>(?:<mspace[^>]*>)?"
+SPACES = {
+    r"<m[io]>([A-Za-z]{2,})</m[io]>": r'<mo lspace="0.15em" rspace="0.15em">\1</mo>',
+    r'<mo(?: stretchy="false")?>(&#x0007C;)</mo>': r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>',
+    rf"({RELATION})<mo>(&#x0(?:2212|002B);)": r'\1<mo form="prefix">\2',
+    r"<mo>(&#x0221E;)</mo>": r"<mi>\1</mi>",
+}
+"""Patterns of MathML and their replacements: names of functions, bars, signs and infinity with TeX's spaces."""
 
 
 def main() -> None:
@@ -49,6 +60,7 @@ def main() -> None:
     shutil.copy(HERE / "zensical.toml", SITE)
     (PAGES / "assets").mkdir()
     shutil.copy(HERE / "iframe-worker.js", PAGES / "assets")
+    shutil.copy(HERE / "formulas.css", PAGES / "assets")
 
 
 def write(name: str, text: str) -> None:
@@ -83,27 +95,45 @@ def link_to_rendered_tables(page: Path) -> None:
 def typeset_formulas(page: Path) -> None:
     """Turns the formulas of a page into MathML, which browsers draw without a script.
 
-    They are written as on GitHub: ```math before a block, and $`...`$ in a line. Each stands in
-    an element of HTML, because a line that begins with a formula would count as a block.
+    They are written as on GitHub: ```math before a block, and $`...`$ in a line.
     """
     text = page.read_text(encoding="utf-8")
     text = re.sub(
         r"^```math\n(.*?)^```$",
-        lambda found: f'<div style="margin: 1em 0">{convert_formula(found[1], "block")}</div>',
+        lambda found: typeset_block(found[1]),
         text,
         flags=re.DOTALL | re.MULTILINE,
     )
     text = re.sub(
-        r"\$`([^`]+)`\$",
-        lambda found: f"<span>{convert_formula(found[1], 'inline')}</span>",
+        r"(\(?)\$`([^`]+)`\$([).,;:]*)",
+        lambda found: typeset_in_line(found[2], before=found[1], after=found[3]),
         text,
     )
     page.write_text(text, encoding="utf-8")
 
 
+def typeset_block(latex: str) -> str:
+    """Returns a formula as a block, which scrolls where the page is narrower."""
+    return f'<div class="formula">{convert_formula(latex, "block")}</div>'
+
+
+def typeset_in_line(latex: str, *, before: str, after: str) -> str:
+    """Returns a formula in an element that no line break parts from the punctuation around it.
+
+    A line that began with the formula itself would count as a block. A long formula scrolls.
+    """
+    formula = convert_formula(latex, "inline")
+    characters = html.unescape(re.sub("<[^>]*>", "", formula))
+    kind = "formula long" if len(characters) >= LONG_FORMULA else "formula"
+    return f'<span class="{kind}">{before}{formula}{after}</span>'
+
+
 def convert_formula(latex: str, display: str) -> str:
     """Returns a formula as MathML. Blanks are removed, because Markdown would see paragraphs."""
-    return re.sub(r"\s*\n\s*", " ", convert(latex.strip(), display=display))
+    mathml = re.sub(r"\s*\n\s*", " ", convert(latex.strip(), display=display))
+    for pattern, replacement in SPACES.items():
+        mathml = re.sub(pattern, replacement, mathml)
+    return mathml
 
 
 def render_table(path: Path) -> str:

@@ -131,12 +131,12 @@ def check_random_cells(structures: Sequence[tuple[str, dict[str, Any]]], cells: 
         cells -= count
 
 
-def test_400_random_cells_have_the_bits_of_their_runs_alone() -> None:
+def test_400_random_cells_have_single_run_bits() -> None:
     check_random_cells(QUICK, 400)
 
 
 @pytest.mark.long
-def test_2000_random_cells_have_the_bits_of_their_runs_alone() -> None:
+def test_2000_random_cells_have_single_run_bits() -> None:
     check_random_cells(STRUCTURES, 2000)
 
 

@@ -61,9 +61,7 @@ def push_in_many_ways(scenario: Scenario, site: str) -> list[Push]:
 
 
 @pytest.mark.parametrize("name", ["live-4g", "live-paper"])
-def test_twins_of_a_live_log_are_equal_in_lanes(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_twins_of_live_log_equal_in_lanes(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     log = tn.open_log(GOLDEN / f"{name}.mcap")
     twins = check_both_ways(monkeypatch, lambda: run_twins(log, choose_pushes(log.scenario)))
     assert twins.same
@@ -79,7 +77,7 @@ def test_scaled_twins_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> Non
     assert twins.paths[2].pushed == (26,)
 
 
-def test_twins_of_a_compiled_law_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_twins_of_compiled_law_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     wave = {"control.law": "wave", "scheme": "digital"}
     scenario = load_scenario("two_sites", {"link.delay_ms": 120.0, **wave})
     pushes = push_in_many_ways(scenario, "m")

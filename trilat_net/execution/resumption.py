@@ -184,6 +184,7 @@ class RecordedInputs(Generic[Change]):
         ends: Last tick of each site.
         changes: Changes that took effect at the site, by tick.
         links: Links over which the site receives, in the order of its peers.
+        states: Records of the site, if they are not to be decoded as those of `part` are.
 
     Attributes:
         samples: Samples of each peer, by the tick in which the peer published them.
@@ -201,14 +202,21 @@ class RecordedInputs(Generic[Change]):
         ends: Mapping[str, int],
         changes: Mapping[int, Sequence[Change]],
         links: Sequence[LinkSetup],
+        states: Sequence[State] | None = None,
     ) -> None:
         self._part = part
+        self._states = part.states if states is None else states
         self._links = links
         self.samples = [samples[peer] for peer in part.peers]
         self.ends = [ends[peer] for peer in part.peers]
         self._changes = sorted(changes.items(), reverse=True)
         self.assumed: list[set[int]] = [set() for _ in part.peers]
         self.lacking: list[set[int]] = [set() for _ in part.peers]
+
+    @property
+    def next_change_tick(self) -> int | None:
+        """Tick at which the next change takes effect. None if there are no further changes."""
+        return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
         """Removes and returns the changes that take effect up to a tick.
@@ -284,7 +292,7 @@ class RecordedInputs(Generic[Change]):
             detached: True if the site, while it is at rest, holds a position of its own instead
                 of following other sites.
         """
-        states = self._part.states
+        states = self._states
         if row < 2:
             return False
         tick = states[row].tick
@@ -312,7 +320,7 @@ class RecordedInputs(Generic[Change]):
             row: Index of the record of the next tick, among the records of the site.
             changes: Changes of settings since the last executed tick of the site.
         """
-        states = self._part.states
+        states = self._states
         peers = self._part.peers
         for change in changes:
             site.apply_change(change, states[row].t_ns)
@@ -407,7 +415,7 @@ class RecordedInputs(Generic[Change]):
             and ticks of samples that probably arrived. No record lists the latter, and they are
             older than the record or than the first sample that a later record lists.
         """
-        states = self._part.states
+        states = self._states
         t_ns = states[row].t_ns
         listing = self._listings[peer]
         position = bisect_left(listing.rows, row)
@@ -440,7 +448,7 @@ class RecordedInputs(Generic[Change]):
             Tick of the sample. -1 if these records list no sample of the peer.
         """
         newest = -1
-        for state in self._part.states[max(0, row - _LOOK_BACK) : row]:
+        for state in self._states[max(0, row - _LOOK_BACK) : row]:
             for sender, tick, _ in state.rx:
                 if sender == peer:
                     newest = max(newest, tick)
@@ -455,7 +463,7 @@ class RecordedInputs(Generic[Change]):
         next record after a gap list.
         """
         listings = [_PeerListing(first_rows={}, rows=[], first_ticks=[]) for _ in self.samples]
-        for row, state in enumerate(self._part.states):
+        for row, state in enumerate(self._states):
             for peer, sample_tick, _ in state.rx:
                 # A damaged record may list any peer.
                 is_known_peer = 0 <= peer < len(listings)

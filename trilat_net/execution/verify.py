@@ -27,6 +27,7 @@ import msgspec
 from .. import process
 from ..core.plug.law_channel import LawChannel
 from ..core.step.fingerprint import compute_fingerprint
+from ..core.step.recorded_ticks import TickRepeater
 from ..core.step.site_arrays import MAX_RAMPS
 from ..core.step.site_setup import StaleAction
 from ..core.step.site_step import Site
@@ -38,11 +39,12 @@ from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..log.running_digest import Integrity
 from ..log.session_check import judge_integrity
-from ..log.site_log import SiteLog
+from ..log.site_log import LazyRecords, RecordsByTick, SiteLog
 from ..net.messages import MODE_WORDS, STATE_VECTORS, State
 from ..own_code.code_consent import find_user_laws
 from ..recorded_change import count_skipped_ticks
 from ..scenario import parse_core_change
+from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable, can_repeat, make_sample_table
 from .resumption import ArrivalEntry, RecordedInputs, read_output
 
 TOLERANCE = 1e-9
@@ -337,6 +339,8 @@ class VerifyResult:
 
 PROGRESS_EVERY = 256
 """Number of records between two reports of progress."""
+_MOST_SINGLE_RECORDS = 1 << 12
+"""Largest number of records that are examined one by one before the compiled loop is tried."""
 
 
 class _SiteVerifier:
@@ -351,10 +355,14 @@ class _SiteVerifier:
     that differs does not count as different, but as impossible to judge. The same holds for a
     sample that arrived, but whose content is missing from the log.
 
+    Most records are plain: their state is certain, and all of their inputs are in the log. A
+    compiled loop executes their ticks. It ends before the first record that differs. This
+    record is then examined like every record that is not plain, by `Site.step`.
+
     Args:
         log: The log.
         site: Name of the site.
-        by_tick: Records of all sites, by site and tick.
+        samples: Samples of all sites for the compiled loop. None if it cannot be used.
         result: Object to which the counts and differences are added.
         resume_every: Every how many ticks the site is restored from the records, see `verify`.
             0 means never.
@@ -364,7 +372,7 @@ class _SiteVerifier:
         self,
         log: Log,
         site: str,
-        by_tick: Mapping[str, Mapping[int, State]],
+        samples: SampleTable | None,
         result: VerifyResult,
         resume_every: int = 0,
     ) -> None:
@@ -391,12 +399,23 @@ class _SiteVerifier:
         self._equal = equal_bits if result.whole_run else _equal_to_tolerance
         self._certain = True
         self._law_failed = False
+        self._plain_rows: PlainRows | None = None
+        self._repeater: TickRepeater | None = None
+        # Number of records to examine one by one before the compiled loop is tried again, now
+        # and after its next failure.
+        self._single_records = 0
+        self._next_single_records = 1
+        indexed = self._log.indexed
+        if samples is not None and indexed is not None and can_repeat(self._site):
+            self._plain_rows = PlainRows(self._log, indexed, samples, resume_every)
+        self._states = _list_states(self._log, lazy=self._plain_rows is not None)
         self._inputs = RecordedInputs(
             part=log[site],
-            samples=by_tick,
+            samples=_map_records(log, lazy=self._plain_rows is not None),
             ends=log.last_ticks,
             changes=log.changes(site),
             links=setup.links,
+            states=self._states,
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
@@ -414,35 +433,93 @@ class _SiteVerifier:
         name = self._log.name
         judged_before = result.records - result.unjudged  # of sites that were executed before
         next_tick = 0  # the tick whose record is expected next
-        for row, state in enumerate(self._log.states):
+        row = 0
+        if len(self._log):
+            next_tick = self._change_start(row, next_tick)
+        while row < len(self._log):
+            repeated = self._repeat_plain(row, next_tick)
+            if repeated:
+                if report is not None:
+                    report(result.records)
+                result.records += repeated
+                result.identical += repeated
+                row += repeated
+                next_tick += repeated
+                continue
             if report is not None and row % PROGRESS_EVERY == 0:
                 report(result.records)
-            result.records += 1
-
-            # Two records of the same tick cannot come from one run of the site.
-            is_known_boot = state.boot in self._starts
-            is_repeated = state.tick == next_tick - 1
-            if is_repeated and not is_known_boot:
-                result.add_difference(
-                    self._make_difference(state, "tick", state.tick, next_tick)
-                )
-                continue
-
-            # A site that left and returned has a new start (boot).
-            is_other_boot = state.boot != self._boot and is_known_boot
-            if self._boot is None or is_other_boot:
-                next_tick = self._change_start(row, next_tick)
-            # A site that was late skipped ticks, which is no gap. Its record states how many.
-            expected_tick = next_tick + count_skipped_ticks(state.cmd)
-            if state.tick != expected_tick:
-                result.gaps.append((name, next_tick, state.tick - 1))
-                self._certain = False
-            next_tick = state.tick + 1
-            self._execute_record(row, state)
+            next_tick = self._examine_record(row, next_tick)
+            row += 1
 
         result.coverage.judged[name] = result.records - result.unjudged - judged_before
         if next_tick <= self._last_tick:
             result.gaps.append((name, next_tick, self._last_tick))
+
+    def _repeat_plain(self, row: int, next_tick: int) -> int:
+        """Executes the ticks of plain records by the compiled loop.
+
+        Args:
+            row: Row of the first record.
+            next_tick: Tick whose record is expected next.
+
+        Returns:
+            The number of records that are identical to the execution. 0 if the next record is
+            to be examined by itself.
+        """
+        rows = self._plain_rows
+        if rows is None or not self._certain or self._law_failed:
+            return 0
+        if self._single_records:
+            self._single_records -= 1
+            return 0
+        is_next = int(self._log.tick[row]) == next_tick and rows.read_boot(row) == self._boot
+        count = rows.count_plain(row, self._inputs.next_change_tick) if is_next else 0
+        if count < LEAST_ROWS:
+            return 0
+
+        if self._repeater is None:
+            self._repeater = TickRepeater(self._site)
+        repeated = rows.repeat(self._repeater, row, count, external=self._external)
+        # Where records differ or calendars must grow again and again, the loop is no gain.
+        if repeated == count:
+            self._next_single_records = 1
+        elif repeated < _MOST_SINGLE_RECORDS:
+            self._single_records = self._next_single_records
+            self._next_single_records = min(2 * self._next_single_records, _MOST_SINGLE_RECORDS)
+        return repeated
+
+    def _examine_record(self, row: int, next_tick: int) -> int:
+        """Examines one record, and adds what it finds to the result.
+
+        Args:
+            row: Row of the record.
+            next_tick: Tick whose record is expected next.
+
+        Returns:
+            Tick whose record is expected after this one.
+        """
+        result = self._result
+        state = self._states[row]
+        result.records += 1
+
+        # Two records of the same tick cannot come from one run of the site.
+        is_known_boot = state.boot in self._starts
+        is_repeated = state.tick == next_tick - 1
+        if is_repeated and not is_known_boot:
+            result.add_difference(self._make_difference(state, "tick", state.tick, next_tick))
+            return next_tick
+
+        # A site that left and returned has a new start (boot).
+        is_other_boot = state.boot != self._boot and is_known_boot
+        if is_other_boot:
+            next_tick = self._change_start(row, next_tick)
+        # A site that was late skipped ticks, which is no gap. Its record states how many.
+        expected_tick = next_tick + count_skipped_ticks(state.cmd)
+        if state.tick != expected_tick:
+            result.gaps.append((self._log.name, next_tick, state.tick - 1))
+            self._certain = False
+        self._execute_record(row, state)
+        return state.tick + 1
 
     def _execute_record(self, row: int, state: State) -> None:
         """Judges a record: executes its tick again, and compares the result with the record.
@@ -517,7 +594,7 @@ class _SiteVerifier:
             result is `next_tick`.
         """
         name = self._log.name
-        self._boot = self._log.states[row].boot
+        self._boot = self._read_boot(row)
         self._start_row = row
         first_tick = self._starts.get(self._boot)
         if first_tick is None or first_tick < next_tick:
@@ -534,11 +611,22 @@ class _SiteVerifier:
         # The remaining changes before this tick concern the previous start, so drop them.
         self._inputs.pop_changes(first_tick - 1)
         self._applied.clear()
-        self._site = Site(self._setup)
+        self._set_site(Site(self._setup))
         self._site.start_at(first_tick)
         self._start_tick = first_tick
         self._certain = True  # the initial state of a site is known
         return first_tick
+
+    def _read_boot(self, row: int) -> int:
+        """Returns the boot in a record, the number that identifies a start of the site."""
+        if self._plain_rows is not None:
+            return self._plain_rows.read_boot(row)
+        return self._states[row].boot
+
+    def _set_site(self, site: Site) -> None:
+        """Replaces the executed site by another one."""
+        self._site = site
+        self._repeater = None
 
     def _replace_site(self, row: int, state: State) -> None:
         """Replaces the executed site by a new one, whose state is still to be restored.
@@ -556,7 +644,7 @@ class _SiteVerifier:
         """
         if not self._certain or not self._can_resume(row):
             return
-        self._site = Site(self._setup)
+        self._set_site(Site(self._setup))
         self._certain = False
         # Settings are not part of the state. The new site gets them as the old one got them.
         if self._start_tick:
@@ -593,7 +681,7 @@ class _SiteVerifier:
             state: The record.
         """
         result = self._result
-        states = self._log.states
+        states = self._states
         peers = self._log.peers
         difference = self._find_other_sender(state)
 
@@ -781,7 +869,10 @@ def _execute_sites(
         report: Function that is called now and then with the number of records so far.
         resume_every: See `verify`.
     """
-    by_tick = {name: log[name].by_tick for name in log.sites}
+    # On another platform, each tick is computed from the two records before it.
+    samples = make_sample_table(log) if result.whole_run else None
+    if samples is None:
+        _map_records(log, lazy=False)  # raises an error if a record cannot be read
     withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]
     withheld = [name for law in withheld_laws for name in law.sites if name in sites]
     result.withheld += withheld
@@ -792,9 +883,34 @@ def _execute_sites(
         if name in withheld:
             continue
         verifier = _SiteVerifier(
-            log=log, site=name, by_tick=by_tick, result=result, resume_every=resume_every
+            log=log, site=name, samples=samples, result=result, resume_every=resume_every
         )
         verifier.run(report)
+
+
+def _list_states(part: SiteLog, *, lazy: bool) -> Sequence[State]:
+    """Returns the records of a site.
+
+    Args:
+        part: Records of the site.
+        lazy: True if only few of them will be accessed.
+    """
+    return LazyRecords(part.payloads, part.decode, heavy=True) if lazy else part.states
+
+
+def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
+    """Returns the records of all sites of a log, by site and tick.
+
+    Args:
+        log: The log.
+        lazy: True if only few of them will be accessed.
+    """
+    if not lazy:
+        return {name: log[name].by_tick for name in log.sites}
+    return {
+        name: RecordsByTick(_list_states(part, lazy=True), part.tick)
+        for name, part in log.items()
+    }
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:

@@ -319,7 +319,7 @@ class Log(Result, Mapping[str, SiteLog]):
             except WireError as error:
                 problem = problem or str(error)
         if problem:
-            lost = count_nouns(len(channel.payloads) - len(messages), "message")
+            lost = count_nouns(len(channel) - len(messages), "message")
             self.unreadable.append(
                 f"{self.source}: {lost} on {topic} cannot be read: {problem[:200]}"
             )

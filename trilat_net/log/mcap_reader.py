@@ -8,6 +8,8 @@ Invariant:
     - The reader has one unpacked chunk in memory at a time. Parts that cannot be read are
       skipped and reported.
     - The messages of a log stay encoded until they are needed.
+    - `McapReader.blocks` yields the messages of `McapReader.messages`, in the same order on
+      each channel, and finds the same damage.
     - Channels that are written for viewers (/viz) are skipped.
     - The memory is bounded, even if a file was made to do harm. A channel whose messages would
       need too much memory is read in part. The other channels are read completely.
@@ -18,7 +20,7 @@ from array import array
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -30,6 +32,8 @@ from ..net import topics
 from ..scenario import parse_embedded
 from . import mcap_records
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
+from .packed import chunk_walk
+from .packed.packed_messages import PADDING, Ints, PackedMessages
 from .running_digest import DIGESTS, Integrity, RunningDigest
 
 _READ = {
@@ -57,6 +61,8 @@ _LONG_RATIO = 24
 """Estimate of the memory of a decoded message: _DECODED_BYTES, and _LONG_RATIO bytes for every
 byte of its payload beyond _LONG_BYTES.
 """
+_SKIPPED_BYTES = 100
+"""Estimate of the memory of a message that is not decoded, without its payload."""
 _NAME_BYTES = 600
 _NAME_RATIO = 20
 """Estimate of the memory of a channel's definition: _NAME_BYTES, and _NAME_RATIO bytes for
@@ -126,12 +132,84 @@ class McapMessage(NamedTuple):
     sequence: int
 
 
+class MessageBlock(NamedTuple):
+    """Messages of one topic that follow each other in a chunk.
+
+    Attributes:
+        topic: Topic of the channel.
+        chunk: The unpacked chunk, or the payload of a single message.
+        run: The messages of all channels that a walk has found in the chunk.
+        listed: Number of messages in `run`.
+        slot: Slot of the channel in `run`.
+    """
+
+    topic: str
+    chunk: NDArray[np.uint8]
+    run: chunk_walk.MessageRun
+    listed: int
+    slot: int
+
+    @property
+    def messages(self) -> int:
+        """Number of messages."""
+        return int(self.run.counts[self.slot])
+
+    @property
+    def most_bytes(self) -> int:
+        """Upper limit of the length of all payloads, in bytes."""
+        return int(self.run.lengths[self.slot])
+
+    def copy_payloads(self, target: NDArray[np.uint8], offset: int) -> tuple[Ints, Ints]:
+        """Copies the payloads one after another. The reader must not have read further.
+
+        Args:
+            target: Array that receives the payloads.
+            offset: Offset of the first byte in `target`.
+
+        Returns:
+            The place after each payload, shape (K,), and the times of arrival and of sending,
+            in Unix time, in ns, shape (2, K). A time of 2^63 ns or later is negative: it has
+            the bits of an unsigned number.
+        """
+        ends = np.zeros(self.messages, np.int64)
+        times = np.zeros((2, self.messages), np.int64)
+        chunk_walk.copy_payloads(
+            data=self.chunk,
+            count=self.listed,
+            slot=self.slot,
+            run=self.run,
+            payloads=target,
+            offset=offset,
+            ends=ends,
+            times=times,
+        )
+        return ends, times
+
+
+def _make_single_block(message: McapMessage) -> MessageBlock:
+    """Returns a block of one message."""
+    length = len(message.payload)
+    run = chunk_walk.allocate_run(1)
+    run.ends[0] = length
+    run.log_ns.view(np.uint64)[0] = message.log_time_ns
+    run.publish_ns.view(np.uint64)[0] = message.publish_time_ns
+    run.counts[0] = 1
+    run.lengths[0] = length
+    chunk = np.frombuffer(message.payload, np.uint8)
+    return MessageBlock(message.topic, chunk, run, listed=1, slot=0)
+
+
+_BLOCK_BYTES = 1 << 12
+"""Size of a chunk from which on its messages are read in blocks."""
+
+
 class McapReader:
     """Reader of one MCAP file, from its beginning to its end.
 
-    There are two ways of reading. `messages` yields the messages, and nothing else. `scan`
-    yields the records and the damaged parts of the file, as the scanner finds them, for the
-    check and the recovery of damaged files; `read_record` yields the messages of a record.
+    There are three ways of reading. `messages` yields the messages, and nothing else. `blocks`
+    yields them in blocks, which is much faster. `scan` yields the records and the damaged parts
+    of the file, as the scanner finds them, for the check and the recovery of damaged files;
+    `read_record` yields the messages of a record.
 
     Args:
         stream: The file, opened for reading.
@@ -181,6 +259,10 @@ class McapReader:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._session_channels: set[int] = set()
+        # Numbers of the channels with a slot, in the order of the slots.
+        self._slots: list[int] = []
+        self._slot_of_channel = np.full(chunk_walk.MOST_CHANNELS, -1, np.int32)
+        self._run = chunk_walk.allocate_run(0, chunk_walk.CAPACITY)
         # Memory that may still be used, for all messages and for each channel, in bytes.
         self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
         share = math.inf if self._memory_left is None else _CHANNEL_SHARE * self._memory_left
@@ -216,9 +298,7 @@ class McapReader:
         Raises:
             LogError: The file is no MCAP file, or unpacks to far too much for its size.
         """
-        if not self.scanner.begins:
-            reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
-            raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
+        self._check_begin()
         for item in self._walk():
             if isinstance(item, mcap_records.Damage) or item.frame.opcode not in _READ:
                 continue
@@ -227,6 +307,35 @@ class McapReader:
                 yield from self._read_messages(item)
             except mcap_records.UnreadableRecord as error:
                 self._note_damage(item.frame, error)
+
+    def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[MessageBlock]:
+        """Yields the messages of some topics in blocks, as `messages` finds them.
+
+        Args:
+            topic_is_kept: Function that decides whether the messages of a topic are yielded.
+
+        Raises:
+            LogError: The file is no MCAP file, or unpacks to far too much for its size.
+        """
+        self._check_begin()
+        is_kept = cache(topic_is_kept)
+        for item in self._walk():
+            if isinstance(item, mcap_records.Damage) or item.frame.opcode not in _READ:
+                continue
+            try:
+                yield from self._read_blocks(item, is_kept)
+            except mcap_records.UnreadableRecord as error:
+                self._note_damage(item.frame, error)
+
+    def _check_begin(self) -> None:
+        """Checks that the file begins as an MCAP file.
+
+        Raises:
+            LogError: It does not.
+        """
+        if not self.scanner.begins:
+            reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
+            raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
 
     def scan(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, see `RecordScanner.scan`.
@@ -342,9 +451,6 @@ class McapReader:
     def _read_messages(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
         """Yields the messages of a record, and stores its schemas and channels.
 
-        Messages and definitions are added to the digests. The local variables make this loop
-        fast, which runs for every message of a file.
-
         Args:
             record: The record, of a kind in `_READ`.
 
@@ -352,8 +458,23 @@ class McapReader:
             UnreadableRecord: The record makes no sense.
             LogError: The messages need too much memory.
         """
-        frame = record.frame
-        data = self._unpack(record)
+        yield from self._read_rest(_ReadPart(record.frame, self._unpack(record)))
+
+    def _read_rest(self, part: "_ReadPart") -> Iterator[McapMessage]:
+        """Yields the messages of a record that have not been read yet.
+
+        Messages and definitions are added to the digests. The local variables make this loop
+        fast, which runs for every message of a file.
+
+        Args:
+            part: The part of the record that has been read.
+
+        Raises:
+            UnreadableRecord: The record makes no sense.
+            LogError: The messages need too much memory.
+        """
+        frame = part.frame
+        data = part.data
         find_topic = self._topics.get
         session_channels = self._session_channels
         memory_left = self._channel_memory_left
@@ -362,10 +483,7 @@ class McapReader:
         new = tuple.__new__  # twice as fast as calling the class `McapMessage`
         memory = 0
         messages = 0
-        view = memoryview(data)
-        # Offset up to which `data` has been added to the digest of the messages.
-        digested = 0
-        for opcode, begin, end in mcap_records.iterate_records(data):
+        for opcode, begin, end in mcap_records.iterate_records(data, part.offset):
             if opcode == mcap_records.OP_MESSAGE:
                 length = end - begin
                 messages += 1
@@ -379,7 +497,7 @@ class McapReader:
                     if length > _LONG_BYTES:
                         cost += (length - _LONG_BYTES) * _LONG_RATIO
                 else:
-                    cost = 100 + length
+                    cost = _SKIPPED_BYTES + length
                 remaining = memory_left[channel]
                 if remaining < cost:
                     self._cut_channel(channel, frame)
@@ -391,14 +509,138 @@ class McapReader:
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in mcap_records.DEFINITIONS:
-                # The digest of the messages leaves out the definitions between them.
-                record_start = begin - mcap_records.RECORD_HEAD_BYTES
-                self._chain.add_records(view[digested:record_start], 0)
-                digested = end
-                self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
-                self._define(opcode, data[begin:end])
-        self._chain.add_records(view[digested:], messages)
-        self._take_memory(memory, frame)
+                self._read_definition(part, opcode, begin, end)
+        self._end_part(part, part.messages + messages, part.memory + memory)
+
+    def _read_definition(self, part: "_ReadPart", opcode: int, begin: int, end: int) -> None:
+        """Stores a definition in a record, and adds the messages before it to the digest.
+
+        Args:
+            part: The part of the record that has been read.
+            opcode: Kind of the definition.
+            begin: Place of the definition's content.
+            end: Place after its content.
+
+        Raises:
+            UnreadableRecord: The definition cannot be decoded.
+            LogError: There is not enough memory left.
+        """
+        # The digest of the messages leaves out the definitions between them.
+        record_start = begin - mcap_records.RECORD_HEAD_BYTES
+        self._chain.add_records(memoryview(part.data)[part.digested : record_start], 0)
+        part.digested = end
+        self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), part.frame)
+        self._define(opcode, part.data[begin:end])
+
+    def _end_part(self, part: "_ReadPart", messages: int, memory: int) -> None:
+        """Adds the rest of a record to the digest, and subtracts the memory of its messages.
+
+        Args:
+            part: The part of the record that has been read.
+            messages: Number of messages in the record.
+            memory: Memory that the messages need, in bytes.
+
+        Raises:
+            LogError: There is not enough memory left.
+        """
+        self._chain.add_records(memoryview(part.data)[part.digested :], messages)
+        self._take_memory(memory, part.frame)
+
+    def _read_blocks(
+        self, record: mcap_records.ScannedRecord, is_kept: Callable[[str], bool]
+    ) -> Iterator[MessageBlock]:
+        """Yields the messages of a record in blocks, and stores its schemas and channels.
+
+        Args:
+            record: The record, of a kind in `_READ`.
+            is_kept: Function that decides whether the messages of a topic are yielded.
+
+        Raises:
+            UnreadableRecord: The record makes no sense.
+            LogError: The messages need too much memory.
+        """
+        part = _ReadPart(record.frame, self._unpack(record))
+        data = part.data
+        chunk = np.frombuffer(data, np.uint8)
+        is_long = len(data) >= _BLOCK_BYTES
+        while is_long and part.offset < len(data):
+            run = self._clear_run()
+            count, offset, reason = chunk_walk.walk_messages(
+                chunk, part.offset, self._slot_of_channel, _LONG_BYTES, run
+            )
+            if reason == chunk_walk.AT_UNKNOWN or not self._take_run(part, run):
+                break  # the messages from `part.offset` on are read one by one
+            part.messages += count
+            part.offset = offset
+            yield from self._divide_run(chunk, count, run, is_kept)
+            if reason == chunk_walk.AT_DEFINITION:
+                opcode, begin, end = next(mcap_records.iterate_records(data, offset))
+                self._read_definition(part, opcode, begin, end)
+                part.offset = end
+
+        is_read = is_long and part.offset == len(data)
+        if is_read:
+            self._end_part(part, part.messages, part.memory)
+            return
+        for message in self._read_rest(part):
+            if is_kept(message.topic):
+                yield _make_single_block(message)
+
+    def _clear_run(self) -> chunk_walk.MessageRun:
+        """Returns arrays for the messages of a walk, with sums of zero for every slot."""
+        sums = np.zeros((4, len(self._slots)), np.int64)
+        self._run = self._run._replace(
+            counts=sums[0], lengths=sums[1], excess=sums[2], firsts=sums[3]
+        )
+        return self._run
+
+    def _take_run(self, part: "_ReadPart", run: chunk_walk.MessageRun) -> bool:
+        """Subtracts the memory of some messages, unless a channel needs too much of it.
+
+        Args:
+            part: The part of the record that has been read. The memory is added to it.
+            run: The messages.
+
+        Returns:
+            False, without a change, if a channel needs too much memory.
+        """
+        counts = run.counts.tolist()
+        excess = run.excess.tolist()
+        lengths = run.lengths.tolist()
+        costs = {}
+        for slot, channel in enumerate(self._slots):
+            if channel in self._session_channels:
+                costs[channel] = _DECODED_BYTES * counts[slot] + _LONG_RATIO * excess[slot]
+            else:
+                costs[channel] = _SKIPPED_BYTES * counts[slot] + lengths[slot]
+        if any(cost > self._channel_memory_left[channel] for channel, cost in costs.items()):
+            return False
+        for channel, cost in costs.items():
+            self._channel_memory_left[channel] -= cost
+            part.memory += cost
+        return True
+
+    def _divide_run(
+        self,
+        chunk: NDArray[np.uint8],
+        count: int,
+        run: chunk_walk.MessageRun,
+        is_kept: Callable[[str], bool],
+    ) -> Iterator[MessageBlock]:
+        """Yields messages that a walk has found, a block for each channel, without the others.
+
+        Args:
+            chunk: The unpacked chunk.
+            count: Number of messages.
+            run: The messages.
+            is_kept: Function that decides whether the messages of a topic are yielded.
+        """
+        present = np.flatnonzero(run.counts)
+        # Channels in the order of their first messages.
+        for slot in present[np.argsort(run.firsts[present])].tolist():
+            topic = self._topics[self._slots[slot]]
+            if is_kept(topic):
+                yield MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
         """Compares the file with its digests, to find out whether it was changed.
@@ -448,9 +690,25 @@ class McapReader:
                 metadata=record.metadata,
                 schema_data=data,
             )
+            # Messages of a topic that has two channels alternate, and are read one by one.
+            if topic not in self.channels:
+                self._slot_of_channel[record.id] = len(self._slots)
+                self._slots.append(record.id)
+            else:
+                self._drop_slot(topic)
             self.channels.setdefault(topic, info)
             if topic.startswith("/trilat/"):
                 self._session_channels.add(record.id)
+
+    def _drop_slot(self, topic: str) -> None:
+        """Makes `blocks` read the messages of a topic one by one.
+
+        Args:
+            topic: The topic.
+        """
+        for channel in self._slots:
+            if self._topics[channel] == topic:
+                self._slot_of_channel[channel] = -1
 
     def _cut_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
         """Stops the reading of a channel whose messages take too much memory.
@@ -492,23 +750,82 @@ class McapReader:
             )
 
 
+@dataclass
+class _ReadPart:
+    """Part of a record with messages and definitions that has been read.
+
+    Attributes:
+        frame: Place of the record in the file.
+        data: Messages and definitions of the record, unpacked.
+        offset: Offset in `data` up to which they have been read.
+        digested: Place up to which they have been added to the digest of the messages.
+        messages: Number of messages that have been read.
+        memory: Memory that these messages need, in bytes.
+    """
+
+    frame: mcap_records.RecordFrame
+    data: bytes
+    offset: int = 0
+    digested: int = 0
+    messages: int = 0
+    memory: int = 0
+
+
 _LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
 """Latest time stamp that fits into a signed number of 64 bits."""
 
 
-@dataclass(slots=True)
+_FIRST_BYTES = 1 << 12
+"""Room for the messages of a topic at the beginning, in bytes."""
+
+
 class ChannelMessages:
     """Messages of one topic as a log contains them, still encoded, in the order of the file.
 
     Attributes:
-        payloads: The K messages, as published.
-        log_ns: Time of arrival of each message at the recorder, in Unix time, in ns.
+        log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
         publish_ns: Time of sending that each message states, in Unix time, in ns.
     """
 
-    payloads: list[bytes] = field(default_factory=list)
-    log_ns: "array[int]" = field(default_factory=partial(array, "Q"))
-    publish_ns: "array[int]" = field(default_factory=partial(array, "Q"))
+    def __init__(self) -> None:
+        self._data = np.zeros(_FIRST_BYTES, np.uint8)
+        self._size = 0
+        self._ends = array("q")
+        self.log_ns = array("Q")
+        self.publish_ns = array("Q")
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    @property
+    def payloads(self) -> PackedMessages:
+        """The K messages, as published. Messages that are added later are not included."""
+        data = self._reserve(PADDING)
+        ends = np.array(self._ends, np.int64)
+        starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(ends)]
+        return PackedMessages(data[: self._size + PADDING], starts, ends)
+
+    def payload(self, number: int) -> bytes:
+        """Returns one message.
+
+        Args:
+            number: Number of the message, from 0.
+        """
+        start = self._ends[number - 1] if number else 0
+        return self._data[start : self._ends[number]].tobytes()
+
+    def _reserve(self, size: int) -> NDArray[np.uint8]:
+        """Makes room for further bytes, and returns the array of all bytes.
+
+        Args:
+            size: Number of bytes.
+        """
+        needed = self._size + size
+        if needed > len(self._data):
+            data = np.empty(max(needed, 2 * len(self._data)), np.uint8)
+            data[: self._size] = self._data[: self._size]
+            self._data = data
+        return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
         """Adds the next message of the topic, in the order of the file.
@@ -518,9 +835,26 @@ class ChannelMessages:
             log_ns: Time of arrival at the recorder, in Unix time, in ns.
             publish_ns: Time of sending, in Unix time, in ns.
         """
-        self.payloads.append(payload)
+        data = self._reserve(len(payload))
+        end = self._size + len(payload)
+        data[self._size : end] = np.frombuffer(payload, np.uint8)
+        self._size = end
+        self._ends.append(end)
         self.log_ns.append(log_ns)
         self.publish_ns.append(publish_ns)
+
+    def add_block(self, block: MessageBlock) -> None:
+        """Adds the next messages of the topic.
+
+        Args:
+            block: The messages.
+        """
+        data = self._reserve(block.most_bytes)
+        ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
+        self._size = int(ends[-1])
+        self._ends.frombytes(ends.tobytes())
+        self.log_ns.frombytes(log_ns.tobytes())
+        self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Returns the times of all K messages as arrays.
@@ -592,19 +926,8 @@ def read_contents(
     """
     reader = McapReader(stream, name, progress, kept=not trusted)
     channels: dict[str, ChannelMessages] = {}
-    # The channel of each topic that was read. None for topics that are skipped.
-    channel_of_topic: dict[str, ChannelMessages | None] = {}
-    for topic, payload, log_ns, publish_ns, _ in reader.messages():
-        try:
-            channel = channel_of_topic[topic]
-        except KeyError:
-            key = topics.parse_key(topic.removeprefix("/"))
-            channel = None
-            if key is not None and key.channel in CHANNEL_TYPES:
-                channel = channels.setdefault(topic, ChannelMessages())
-            channel_of_topic[topic] = channel
-        if channel is not None:
-            channel.add(payload, log_ns, publish_ns)
+    for block in reader.blocks(_is_log_topic):
+        channels.setdefault(block.topic, ChannelMessages()).add_block(block)
     _check_head(reader, name)
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
@@ -621,6 +944,12 @@ def read_contents(
     )
 
 
+def _is_log_topic(topic: str) -> bool:
+    """True if the messages of a topic belong to a log of this program."""
+    key = topics.parse_key(topic.removeprefix("/"))
+    return key is not None and key.channel in CHANNEL_TYPES
+
+
 def check_log(stream: BinaryIO, name: str) -> None:
     """Reads a log once without storing its messages, to find out whether it can be opened.
 
@@ -634,7 +963,7 @@ def check_log(stream: BinaryIO, name: str) -> None:
         LogError: The file cannot be opened as a log. The text states the reason.
     """
     reader = McapReader(stream, name)
-    deque(reader.messages(), maxlen=0)
+    deque(reader.blocks(_is_log_topic), maxlen=0)
     _check_head(reader, name)
     try:
         parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")

@@ -205,11 +205,12 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
     return bytes(data)
 
 
-def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
+def iterate_records(data: bytes | bytearray, offset: int = 0) -> Iterator[tuple[int, int, int]]:
     """Finds the records in an unpacked chunk, one after another, without decoding them.
 
     Args:
         data: The unpacked chunk.
+        offset: Offset of the first record to find.
 
     Yields:
         The number of the record's kind, the offset of its content, and the offset after its
@@ -220,7 +221,7 @@ def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
     """
     unpack = RECORD_HEAD.unpack_from
     size = len(data)
-    end = 0
+    end = offset
     while end + RECORD_HEAD_BYTES <= size:
         opcode, length = unpack(data, end)
         begin = end + RECORD_HEAD_BYTES

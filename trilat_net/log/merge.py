@@ -159,10 +159,12 @@ def _recorder_boot(part: LogContents) -> int:
     for channel, kind in kinds.items():
         topic = "/" + topics.key(part.session["session"], topics.RECORDER, channel)
         messages = part.channels.get(topic)
-        if messages is not None and messages.payloads:
+        if messages is not None and len(messages):
             # A message that cannot be decoded is reported when the log is read.
             with suppress(WireError):
-                message: RecorderStats | Event = decode(messages.payloads[-1], kind, READABLE)
+                message: RecorderStats | Event = decode(
+                    messages.payload(len(messages) - 1), kind, READABLE
+                )
                 return message.boot
             return 0
     return 0
@@ -209,15 +211,16 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
     part_ends: list[int] = []
     for part in topic_parts:
         channel = part.channels[topic]
+        payloads = channel.payloads
         # Messages are compared with earlier parts only: a part may repeat its own messages.
         new_indices: dict[Hashable, int] = {}
-        for number, key in enumerate(_list_keys(topic, channel, part.source)):
-            payload = channel.payloads[number]
+        keys = _list_keys(topic, payloads, part.source)
+        for number, (key, payload) in enumerate(zip(keys, payloads, strict=True)):
             index = merged_indices.get(key)
             if index is None:
-                new_indices[key] = len(merged.payloads)
+                new_indices[key] = len(merged)
                 merged.add(payload, channel.log_ns[number], channel.publish_ns[number])
-            elif merged.payloads[index] != payload:
+            elif merged.payload(index) != payload:
                 other = topic_parts[bisect_right(part_ends, index)]
                 message = _describe_message(topic, key)
                 raise LogError(
@@ -225,22 +228,21 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
                     "both"
                 )
         merged_indices |= new_indices
-        part_ends.append(len(merged.payloads))
+        part_ends.append(len(merged))
     return merged
 
 
-def _list_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
+def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[Hashable]:
     """Returns a key for each message of a topic. Copies of a message have the same key.
 
     Args:
         topic: The topic.
-        channel: Messages of the topic.
+        payloads: Messages of the topic, encoded.
         source: Name of the file for error messages.
 
     Raises:
         LogError: A message cannot be decoded.
     """
-    payloads = channel.payloads
     try:
         match topic.rpartition("/")[2]:
             case topics.STATE:

@@ -844,11 +844,12 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
     """
     if log.damaged:
         return ""
-    ticks = np.unique(log[site].tick)
+    ticks = log[site].tick  # in ascending order
+    records = 1 + int(np.count_nonzero(np.diff(ticks))) if len(ticks) else 0
     # The counts of several files were computed from their records, and prove nothing.
     has_one_file = len(log.sources) == 1
     stated = parse_counts(log.account(site)) if has_one_file else {}
-    counted = {"received": len(ticks), "missing": log.missing(site)}
+    counted = {"received": records, "missing": log.missing(site)}
     has_account = stated != {}
     if not log.part and has_account and stated != counted:
         stated_text = " and ".join(f"{stated.get(name, 0)} {name}" for name in counted)
@@ -859,7 +860,7 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
         )
 
     # Number of ticks between the first and the last record that have no record.
-    ticks_without_record = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
+    ticks_without_record = int(ticks[-1] - ticks[0]) + 1 - records if records else 0
     not_executed = min(ticks_without_record, log.absent_ticks(site))
     missing = ticks_without_record - not_executed
     if not missing or log.chain.state is DigestState.INTACT:

@@ -17,6 +17,7 @@ from functools import cached_property, lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import process
 from ..core.arms.task_space import POSE, POSITION
@@ -30,6 +31,8 @@ from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Layout
 from . import record_columns
 from .orientations import align_signs, compute_quaternion_parts, compute_quaternions
+from .packed.indexed_records import index_records
+from .packed.packed_messages import PackedMessages
 from .record_columns import Ints
 
 M = TypeVar("M")
@@ -243,7 +246,13 @@ class RecordsByTick(Mapping[int, State]):
 
     def __init__(self, states: Sequence[State], ticks: Ints) -> None:
         self._states = states
-        self._ticks = ticks.tolist()
+        self._array = ticks
+
+    @cached_property
+    def _ticks(self) -> list[int]:
+        """The ticks as a list, in which a search takes less time than in an array."""
+        ticks: list[int] = self._array.tolist()
+        return ticks
 
     def __getitem__(self, tick: int) -> State:
         row = bisect_right(self._ticks, tick) - 1
@@ -279,14 +288,12 @@ class _RecordField(cached_property[T]):
     property is the name of the field.
 
     Args:
-        decode_column: Function that decodes the field of all records, by its name.
+        read_column: Function that returns the field of all records, by its name.
         meaning: Docstring of the property.
     """
 
-    def __init__(
-        self, decode_column: Callable[[Sequence[bytes], str], T], meaning: str
-    ) -> None:
-        super().__init__(lambda site: site._read(decode_column, self.attrname))
+    def __init__(self, read_column: Callable[["SiteLog", str], T], meaning: str) -> None:
+        super().__init__(lambda site: read_column(site, str(self.attrname)))
         self.__doc__ = meaning
 
 
@@ -300,6 +307,20 @@ class _RecordVector(cached_property[Array]):
     def __init__(self, meaning: str) -> None:
         super().__init__(lambda site: site._read_vectors(self.attrname)[self.attrname])
         self.__doc__ = meaning
+
+
+def _read_ints(site: "SiteLog", field: str) -> Ints:
+    """Returns an integer field of all records of a site, shape (K,)."""
+    if site.indexed is not None and site.indexed.has_ints(field):
+        return freeze(site.indexed.ints(field))
+    return site._read(record_columns.decode_ints, field)
+
+
+def _read_objects(site: "SiteLog", field: str) -> NDArray[np.object_]:
+    """Returns the field `mode` or `mem` of all records of a site, shape (K,)."""
+    if site.indexed is None:
+        return site._read(record_columns.decode_strings, field)
+    return freeze(site.indexed.modes if field == "mode" else site.indexed.memories)
 
 
 class SiteLog:
@@ -324,6 +345,8 @@ class SiteLog:
 
     Attributes:
         payloads: The encoded records, in the order of their ticks.
+        indexed: The records, if all of them have the exact layout that this program writes.
+            Their fields are then read by compiled code.
         tick: Tick of each record, shape (K,).
         log_time_ns: Time of arrival of each record at the recorder, in Unix time, shape (K,),
             in ns.
@@ -354,14 +377,20 @@ class SiteLog:
         self.layout = layout
         self.axes = axes
         self._source = source
-        self.payloads = payloads
-        self.tick = self._read(record_columns.decode_ticks)
+        self.payloads = PackedMessages.pack(payloads)
+        self.indexed = index_records(self.payloads, name, peers, layout)
+        if self.indexed is None:
+            self.tick = self._read(record_columns.decode_ticks)
+        else:
+            self.tick = self.indexed.ticks
         zeros = np.zeros(len(payloads), dtype=np.int64)
         self.log_time_ns, self.publish_time_ns = times or (zeros, zeros)
         if (self.tick[1:] < self.tick[:-1]).any():
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
-            self.payloads = [payloads[n] for n in order.tolist()]
+            self.payloads = self.payloads.select(order)
+            if self.indexed is not None:
+                self.indexed = self.indexed.select(order)
             self.log_time_ns = self.log_time_ns[order]
             self.publish_time_ns = self.publish_time_ns[order]
         freeze((self.tick, self.log_time_ns, self.publish_time_ns))
@@ -394,8 +423,23 @@ class SiteLog:
         Raises:
             LogError: A record cannot be decoded.
         """
+        return self._read_from(self.payloads, decode_column, *arguments)
+
+    def _read_from(
+        self, payloads: Sequence[bytes], decode_column: Callable[..., T], *arguments: Any
+    ) -> T:
+        """Decodes columns of some records, see `_read`.
+
+        Args:
+            payloads: The encoded records.
+            decode_column: Function that decodes them.
+            *arguments: Further arguments of that function.
+
+        Raises:
+            LogError: A record cannot be decoded.
+        """
         try:
-            return freeze(decode_column(self.payloads, *arguments))
+            return freeze(decode_column(payloads, *arguments))
         except WireError as error:
             raise LogError(
                 f"{self._source}: a record of {self.name} cannot be read: {error}"
@@ -415,6 +459,8 @@ class SiteLog:
 
     def _read_vectors(self, *fields: str) -> dict[str, Array]:
         """Returns vectors of all records by name, each of shape (K, length)."""
+        if self.indexed is not None:
+            return freeze(self.indexed.vectors(fields))
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
@@ -426,7 +472,7 @@ class SiteLog:
         Returns:
             The value in each record, shape (K,), in the order of the ticks.
         """
-        return self._read(record_columns.decode_ints, field)
+        return _read_ints(self, field)
 
     def memory(self, first: int, count: int) -> Array:
         """Returns a part of the internal state of the site's control law in all records.
@@ -463,10 +509,13 @@ class SiteLog:
         Returns:
             The record.
         """
-        return self._decode([self.payloads[n]])[0]
+        return self.decode([self.payloads[n]])[0]
 
-    def _decode(self, payloads: Sequence[bytes]) -> list[State]:
+    def decode(self, payloads: Sequence[bytes]) -> list[State]:
         """Decodes whole records and checks them.
+
+        Args:
+            payloads: Encoded records of the site.
 
         Raises:
             LogError: A record cannot be decoded.
@@ -484,7 +533,7 @@ class SiteLog:
         If there are many, a record is decoded only when it is accessed. To compute with a
         single quantity, the arrays such as `q` are much faster.
         """
-        return decode_records(self.payloads, self._decode)
+        return decode_records(self.payloads, self.decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
@@ -536,7 +585,7 @@ class SiteLog:
         return sum(count_skipped_ticks(texts) for texts in self._changes.values())
 
     mode = _RecordField(
-        record_columns.decode_strings,
+        _read_objects,
         'Mode, shape (K,): "run", "hold", "brake", "return", "waiting", "fault", "stopped" '
         'or "diverged".',
     )
@@ -576,21 +625,21 @@ class SiteLog:
         "quaternions. The plant is a simulated environment that the arm moves in."
     )
     mem = _RecordField(
-        record_columns.decode_strings,
+        _read_objects,
         "State of the site and its control law that no other field contains, shape (K,), a "
         "list of numbers each.",
     )
     t_ns = _RecordField(
-        record_columns.decode_ints,
+        _read_ints,
         "Nominal time since the epoch, the common start time of the session, shape (K,), ns.",
     )
     late_us = _RecordField(
-        record_columns.decode_ints,
+        _read_ints,
         "Delay of the tick's start after its nominal time, shape (K,), us. It is 0 in virtual "
         "time.",
     )
     sent_ns = _RecordField(
-        record_columns.decode_ints,
+        _read_ints,
         "Time at which each record was sent, since the epoch, both read from the site's own "
         "clock, shape (K,), ns.",
     )
@@ -690,6 +739,9 @@ class SiteLog:
         its control loop). The key is the name of the peer. The value has the shape (K,), where
         K is the number of records of this site. It is -1 before the first sample of the peer.
         """
+        if self.indexed is not None:
+            ticks = self.indexed.used
+            return freeze({peer: ticks[:, n].copy() for n, peer in enumerate(self.peers)})
         return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
 
     @cached_property
@@ -700,13 +752,21 @@ class SiteLog:
         array contains all arrivals in order, shape (N, 3), with the columns of `rx`: index of
         the peer, tick of the sample, and delay in us.
         """
+        if self.indexed is not None:
+            return freeze(self.indexed.arrivals)
         return self._read(record_columns.decode_arrivals)
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
         """Texts of the field `cmd` by tick, for the records that contain any."""
-        texts = self._read(record_columns.decode_strings, "cmd").tolist()
-        pairs = zip(self.tick.tolist(), texts, strict=True)
+        ticks = self.tick
+        payloads = self.payloads
+        if self.indexed is not None:
+            rows = np.flatnonzero(self.indexed.change_counts)
+            ticks = ticks[rows]
+            payloads = payloads.select(rows)
+        texts = self._read_from(payloads, record_columns.decode_strings, "cmd").tolist()
+        pairs = zip(ticks.tolist(), texts, strict=True)
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:

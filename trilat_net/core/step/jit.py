@@ -537,7 +537,7 @@ def _prefer_wide_vectors(llvm_code: str) -> str:
 
 
 class _LaneLibrary(_LeafLibrary):
-    """The code of a function of lanes, in which all functions that it calls are inlined."""
+    """The code of a loop, or of a function of lanes, in which all its leaves are inlined."""
 
     def _optimize_final_module(self) -> None:
         for function in self._final_module.functions:
@@ -546,6 +546,12 @@ class _LaneLibrary(_LeafLibrary):
                 function.add_function_attribute("alwaysinline")
         self._final_module = parse_assembly(_prefer_wide_vectors(str(self._final_module)))
         super()._optimize_final_module()
+
+
+class _LoopCompiler(_LeafCompiler):
+    """Compiles a function with a long loop, into whose code all leaves are inlined."""
+
+    library_class = _LaneLibrary
 
 
 class _LaneCompiler(_LeafCompiler):
@@ -717,6 +723,15 @@ def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Calla
     )
     dispatcher._cache = cast(Any, _LeafCache)(function)
     return cast(Callable[P, R], dispatcher)
+
+
+def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
+    """Marks a function with a long loop that calls other leaves (decorator).
+
+    All leaves that the loop calls become part of its code. This saves the time in which the
+    descriptions of arrays are passed to them. Python calls the function like any other leaf.
+    """
+    return leaf(function) if _config.DISABLE_JIT else _make_leaf(function, _LoopCompiler)
 
 
 def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:

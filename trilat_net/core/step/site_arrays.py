@@ -317,6 +317,13 @@ class CalendarSizer:
         self._delay_us[peer] = max(self._delay_us[peer], longest_us)
         self.newest[peer] = -1
 
+    def list_rooms(self) -> list[tuple[int, int]]:
+        """Returns for each peer `newest`, and how many ticks a sample waits at most."""
+        waits = [
+            span_ticks(delay_us * 1000, self._rate_hz) + _SLACK for delay_us in self._delay_us
+        ]
+        return list(zip(self.newest, waits, strict=True))
+
     def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
         """Makes sure that a sample fits into the ring buffer of its link.
 

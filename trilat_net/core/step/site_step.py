@@ -19,6 +19,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,7 @@ from .site_arrays import (
     MAX_RAMPS,
     CalendarSizer,
     SiteArrays,
+    TickBuffers,
     apply_change,
     build_site_arrays,
     build_tick_buffers,
@@ -65,6 +67,30 @@ _MODES = {int(mode): mode for mode in Mode}
 _RUN = int(Mode.RUN)
 _DIVERGED = int(Mode.DIVERGED)
 _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
+
+
+class TickParts(NamedTuple):
+    """Parts of a site that execute its ticks.
+
+    Attributes:
+        buffers: Input and output of a tick.
+        calendar_sizer: Enlarges the calendars, in which samples wait.
+        has_user_law: True if a user wrote the control law.
+        reflects: True if the law uses the external torques of the peers.
+        keeps_forces: True if the site stores these torques.
+        glides: True if the site is under the rule `glide`.
+        degrades: True if the site continues without lost peers.
+        hand_index: Index of the live hand among the operators and environments, or -1.
+    """
+
+    buffers: TickBuffers
+    calendar_sizer: CalendarSizer
+    has_user_law: bool
+    reflects: bool
+    keeps_forces: bool
+    glides: bool
+    degrades: bool
+    hand_index: int
 
 
 class Site:
@@ -116,6 +142,7 @@ class Site:
         self._sent = self._buffers.record[sent_first:]
         self._plug_law(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
+        self._hand_index = live[0] if live else -1
         self._hand = self._find_hand(live[0]) if live else None
         counts = [link.channel.received_size for link in setup.links]
         receives = self._user_law is not None and any(counts)
@@ -407,6 +434,20 @@ class Site:
     def arrays(self) -> SiteArrays:
         """Arrays with the present state of the site. They must not be changed."""
         return self._arrays
+
+    @property
+    def parts(self) -> "TickParts":
+        """Parts of the site for `recorded_ticks`, which executes many ticks at once."""
+        return TickParts(
+            buffers=self._buffers,
+            calendar_sizer=self._sizer,
+            has_user_law=self._law is not None,
+            reflects=self._reflects,
+            keeps_forces=self._keeps_forces,
+            glides=self._glides,
+            degrades=self._degrades,
+            hand_index=self._hand_index,
+        )
 
     @property
     def q(self) -> list[float]:

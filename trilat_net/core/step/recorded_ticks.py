@@ -1,0 +1,445 @@
+"""Executes recorded ticks of a site again in one compiled loop, and compares their results.
+
+A tick is one period of the control loop of a site, the process that runs one arm. Its record
+contains its inputs, such as the samples (states of other sites) that arrived, and its results.
+
+Invariant:
+    - The loop calls the stages of the kernel, as `Site.step` does. It contains no equation.
+    - A row of the record counts as repeated only if every computed number has the same bits.
+    - The loop ends before the first tick that it cannot execute or does not repeat. The site
+      is then in the state before this tick, and `Site.step` can execute it.
+"""
+
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..links.link import AHEAD_LIMIT_NS, span_ticks
+from .jit import leaf, loop_leaf
+from .kernel import act_stages, sense_stages, torque_stage
+from .row_fields import SiteRow
+from .site_arrays import SiteArrays, TickBuffers
+from .site_step import Site
+from .ticks import Mode, tick_ns
+from .vectors import Array, IntArray
+
+_RUN = int(Mode.RUN)
+_DIVERGED = int(Mode.DIVERGED)
+_WORD_BYTES = 8
+_BYTE_VALUES = 256
+_ALL_BITS = 0xFFFFFFFF
+
+
+def _list_checksums() -> NDArray[np.uint32]:
+    """Returns the effect of each byte of a word on the CRC-32 of the word, shape (8, 256).
+
+    Row n is for the byte that n bytes follow. It is the checksum of that byte and n zeros, less
+    the checksum of n + 1 zeros: CRC-32 is linear in the bits except for a constant.
+    """
+    table = np.zeros((_WORD_BYTES, _BYTE_VALUES), np.uint32)
+    for zeros in range(_WORD_BYTES):
+        constant = zlib.crc32(bytes(1 + zeros))
+        for value in range(_BYTE_VALUES):
+            table[zeros, value] = zlib.crc32(bytes([value]) + bytes(zeros)) ^ constant
+    return table
+
+
+_CHECKSUMS = _list_checksums()
+
+
+@leaf
+def _update_checksum(crc: int, word: int) -> int:
+    """Returns a CRC-32 after eight more bytes, both without the final inversion.
+
+    Args:
+        crc: The checksum before.
+        word: The bytes as an integer, least byte first.
+    """
+    bits = crc ^ word
+    result = 0
+    for n in range(_WORD_BYTES):
+        result ^= int(_CHECKSUMS[_WORD_BYTES - 1 - n, (bits >> (8 * n)) & 0xFF])
+    return result
+
+
+class RecordedRows(NamedTuple):
+    """Records of consecutive ticks of a site, as numbers for the compiled loop.
+
+    K is the number of records, P the number of peers, m the number of coordinates that the
+    sites share, n the number of joints. A word is the bits of a floating-point number as an
+    integer.
+
+    Attributes:
+        bits: Numbers of the record, see `Layout.columns`, shape (K, floats), as words.
+        used: Tick of the sample in use of each peer, shape (K, P).
+        modes: Mode, shape (K,), see `Mode`.
+        checksums: CRC-32 of the arrivals, shape (K,).
+        first_memory: Index of the first number of `memory` of each record, shape (K + 1,).
+        memory: Numbers of the field `mem` of all records.
+        memory_words: The same numbers as words.
+        first_arrival: Index of the first arrival of each record, shape (K + 1,).
+        arrivals: Peer, tick, and row in the table of samples of all N arrivals, shape (N, 3).
+        hands: Grip, target, and target one second later of a live hand, shape (K, 1 + 2 m).
+            Shape (0, 0) if the site has no live hand.
+        plants: q, qd and the torque ON an external arm, shape (K, 3 n). Shape (0, 0) if the
+            arm is not external.
+    """
+
+    bits: IntArray
+    used: IntArray
+    modes: IntArray
+    checksums: IntArray
+    first_memory: IntArray
+    memory: Array
+    memory_words: IntArray
+    first_arrival: IntArray
+    arrivals: IntArray
+    hands: Array
+    plants: Array
+
+
+class SiteViews(NamedTuple):
+    """Memory of a site in forms that the compiled loop compares and writes.
+
+    Attributes:
+        site: Row of the site, as integers.
+        links: Rows of the links, one after another, as integers.
+        arrivals: Arrivals of a tick, shape (MAX_ARRIVALS, 2 + 2 m): peer, tick, q and qd.
+        forces: External torques of the arrivals, shape (MAX_ARRIVALS, m), as words.
+        record: Results of a tick, shape (floats,), as words.
+        memory: Sources of the numbers in the field `mem`, shape (M, 3): 1 for the links and 0
+            for the site, index in the row, and 1 for an integer that becomes a float.
+        rooms: For each peer the newest sample that is known to fit into the calendar, and how
+            many ticks a sample waits at most, shape (P, 2).
+    """
+
+    site: IntArray
+    links: IntArray
+    arrivals: IntArray
+    forces: IntArray
+    record: IntArray
+    memory: IntArray
+    rooms: IntArray
+
+
+class TickRules(NamedTuple):
+    """Properties of a site that do not change during its run.
+
+    Attributes:
+        rate_hz: Tick rate, Hz.
+        shared: Number m of the coordinates that the sites share.
+        reflects: True if the checksum of the arrivals covers the external torques.
+        keeps_forces: True if the site stores the external torques of its peers.
+        remembers: True if every record has numbers in the field `mem`.
+        hand: Index of the live hand among the operators and environments, or -1.
+        most_pages: Largest number of entries of a calendar.
+        most_ahead: Largest lead of a sample over the present tick, in ticks.
+    """
+
+    rate_hz: int
+    shared: int
+    reflects: bool
+    keeps_forces: bool
+    remembers: bool
+    hand: int
+    most_pages: int
+    most_ahead: int
+
+
+@leaf
+def _has_room(
+    k: int,
+    first: int,
+    last: int,
+    arrivals: IntArray,
+    links: Any,
+    pages: int,
+    rules: Any,
+    rooms: IntArray,
+) -> bool:
+    """Returns False if a calendar must become longer first, see `CalendarSizer.make_room`."""
+    for n in range(first, last):
+        peer = arrivals[n, 0]
+        tick = arrivals[n, 1]
+        if tick <= rooms[peer, 0]:
+            continue
+        peer_hz = links[peer].rate_hz
+        ahead = tick * rules.rate_hz // peer_hz - k
+        if ahead > rules.most_ahead:
+            continue  # the sample will be refused
+        if ahead + rooms[peer, 1] > pages and pages < rules.most_pages:
+            return False
+        rooms[peer, 0] = (k + pages - rooms[peer, 1]) * peer_hz // rules.rate_hz
+    return True
+
+
+@leaf
+def _put_arrivals(
+    first: int, last: int, arrivals: IntArray, samples: IntArray, rules: Any, views: Any
+) -> int:
+    """Writes the arrivals of a tick into its buffers, and returns their CRC-32."""
+    m = rules.shared
+    crc = _ALL_BITS
+    for n in range(first, last):
+        offset = n - first
+        row = arrivals[n, 2]
+        views.arrivals[offset, 0] = arrivals[n, 0]
+        views.arrivals[offset, 1] = arrivals[n, 1]
+        for i in range(2 * m):
+            views.arrivals[offset, 2 + i] = samples[row, i]
+        for i in range(2 + 2 * m):
+            crc = _update_checksum(crc, views.arrivals[offset, i])
+        if rules.keeps_forces:
+            for i in range(m):
+                views.forces[offset, i] = samples[row, 2 * m + i]
+    if rules.reflects:
+        for n in range(first, last):
+            for i in range(m):
+                crc = _update_checksum(crc, samples[arrivals[n, 2], 2 * m + i])
+    return crc ^ _ALL_BITS
+
+
+@leaf
+def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
+    """Writes what a live hand did, and the measured motion of an external arm."""
+    if rules.hand >= 0:
+        hand = arrays.actors[rules.hand]
+        coordinates = (rows.hands.shape[1] - 1) // 2
+        hand.grip = rows.hands[row, 0]
+        for i in range(coordinates):
+            hand.a[i] = rows.hands[row, 1 + i]
+            hand.b[i] = rows.hands[row, 1 + coordinates + i]
+    if rows.plants.shape[0] > 0:
+        s: SiteRow = arrays.site[0]
+        n = s.joints
+        for i in range(n):
+            s.q[i] = rows.plants[row, i]
+            s.qd[i] = rows.plants[row, n + i]
+            s.sensed[i] = rows.plants[row, 2 * n + i]
+
+
+@leaf
+def _equals_record(
+    row: int, crc: int, arrays: SiteArrays, rows: Any, rules: Any, views: Any
+) -> bool:
+    """Returns True if the results of a tick have the same bits as its record."""
+    s: SiteRow = arrays.site[0]
+    difference = rows.modes[row] ^ s.mode
+    difference |= rows.checksums[row] ^ crc
+    for p in range(arrays.links.shape[0]):
+        difference |= rows.used[row, p] ^ arrays.links[p].used
+    for i in range(views.record.shape[0]):
+        difference |= rows.bits[row, i] ^ views.record[i]
+    if difference != 0:
+        return False
+
+    first = rows.first_memory[row]
+    count = rows.first_memory[row + 1] - first
+    if not rules.remembers and (s.mode == _RUN or s.mode == _DIVERGED):
+        return bool(count == 0)
+    if count != views.memory.shape[0]:
+        return False
+    for i in range(count):
+        index = views.memory[i, 1]
+        word = views.links[index] if views.memory[i, 0] else views.site[index]
+        logged = rows.memory[first + i]
+        if views.memory[i, 2]:
+            # The float of an integer is never -0.0.
+            if logged != float(word) or (word == 0 and 1.0 / logged < 0.0):
+                return False
+        elif rows.memory_words[first + i] != word:
+            return False
+    return True
+
+
+def _run_recorded_ticks(
+    first_tick: int,
+    rows: RecordedRows,
+    samples: IntArray,
+    rules: TickRules,
+    views: SiteViews,
+    arrays: SiteArrays,
+    buffers: TickBuffers,
+) -> tuple[int, bool]:
+    """Executes ticks again until one of them differs from its record.
+
+    Args:
+        first_tick: Tick of the first row.
+        rows: Records of the ticks.
+        samples: Table of the samples that arrived, shape (N, 3 m), as words: q, qd, tau_x.
+        rules: Properties of the site.
+        views: Memory of the site.
+        arrays: Arrays of the site; changed.
+        buffers: Input and output of a tick; changed.
+
+    Returns:
+        The number of rows before the first one that was not repeated, and True if this row was
+        executed and differs. It is False if the row was not executed.
+    """
+    for row in range(rows.modes.shape[0]):
+        k = first_tick + row
+        t_ns = tick_ns(k, rules.rate_hz)
+        first = rows.first_arrival[row]
+        last = rows.first_arrival[row + 1]
+        pages = arrays.calendars.shape[1]
+        has_room = _has_room(
+            k, first, last, rows.arrivals, arrays.links, pages, rules, views.rooms
+        )
+        if not has_room:
+            return row, False
+        crc = _put_arrivals(first, last, rows.arrivals, samples, rules, views)
+        _put_inputs(row, arrays, rows, rules)
+        sense_stages(k=k, t_ns=t_ns, count=last - first, arrays=arrays, buffers=buffers)
+        torque_stage(arrays.site, arrays.chain)
+        act_stages(
+            k=k,
+            t_ns=t_ns,
+            site=arrays.site,
+            actors=arrays.actors,
+            table=arrays.table,
+            chain=arrays.chain,
+            record=buffers.record,
+        )
+        if not _equals_record(row, crc, arrays, rows, rules, views):
+            return row, True
+    return rows.modes.shape[0], False
+
+
+_run_planar_ticks = loop_leaf(_run_recorded_ticks)
+# The dynamics of a chain are long, and inlining them at every call takes long to compile.
+_run_chain_ticks = leaf(_run_recorded_ticks)
+
+
+class TickRepeater:
+    """Executes recorded ticks of a site again, many at a time.
+
+    Args:
+        site: The site. Its control law must be built in.
+    """
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._parts = parts = site.parts
+        arrays = site.arrays
+        buffers = parts.buffers
+        self._rules = TickRules(
+            rate_hz=site.rate_hz,
+            shared=site.layout.shared,
+            reflects=parts.reflects,
+            keeps_forces=parts.keeps_forces,
+            remembers=parts.glides,
+            hand=parts.hand_index,
+            most_pages=parts.calendar_sizer.most_pages,
+            most_ahead=span_ticks(AHEAD_LIMIT_NS, site.rate_hz),
+        )
+        self._views = SiteViews(
+            site=_view_words(arrays.site).reshape(-1),
+            links=_view_words(arrays.links).reshape(-1),
+            arrivals=_view_words(buffers.arrivals),
+            forces=_view_words(buffers.forces),
+            record=_view_words(buffers.record),
+            memory=_list_memory_sources(site),
+            rooms=np.zeros((len(site.peers), 2), np.int64),
+        )
+        self._saved = [np.empty_like(array) for array in self._list_arrays()]
+
+    def repeat(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> int:
+        """Executes ticks again until one of them differs from its record.
+
+        Args:
+            first_tick: Tick of the first record. It must be the next tick of the site.
+            rows: Records of consecutive ticks.
+            samples: Table of the samples that arrived, shape (N, 3 m), as words: q, qd, tau_x.
+
+        Returns:
+            The number of records that were repeated. The site is in the state after them.
+        """
+        arrays = self._list_arrays()
+        newest = list(self._parts.calendar_sizer.newest)
+        if [array.shape for array in arrays] != [saved.shape for saved in self._saved]:
+            self._saved = [np.empty_like(array) for array in arrays]
+        for saved, array in zip(self._saved, arrays, strict=True):
+            saved[...] = array
+
+        repeated, has_differed = self._run(first_tick, rows, samples)
+        if has_differed:
+            # Return to the state before the tick that differs.
+            for saved, array in zip(self._saved, arrays, strict=True):
+                array[...] = saved
+            self._parts.calendar_sizer.newest[:] = newest
+            equal_rows = rows._replace(modes=rows.modes[:repeated])
+            again, _ = self._run(first_tick, equal_rows, samples)
+            assert again == repeated
+        return repeated
+
+    def _list_arrays(self) -> list[NDArray[Any]]:
+        """Returns the arrays of the site that its ticks change."""
+        a = self._site.arrays
+        changed = [a.site, a.links, a.dues, a.calendars, a.ramps, a.actors, a.chain]
+        return [array for array in changed if array is not None]
+
+    def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
+        """Executes ticks, see `run_recorded_ticks`."""
+        site = self._site
+        self._views.rooms[:] = self._parts.calendar_sizer.list_rooms()
+        run_recorded_ticks = _run_planar_ticks
+        if site.arrays.chain is not None:
+            run_recorded_ticks = _run_chain_ticks
+        result = run_recorded_ticks(
+            first_tick=first_tick,
+            rows=rows,
+            samples=samples,
+            rules=self._rules,
+            views=self._views,
+            arrays=site.arrays,
+            buffers=self._parts.buffers,
+        )
+        self._parts.calendar_sizer.newest[:] = self._views.rooms[:, 0].tolist()
+        return result
+
+
+def _view_words(array: NDArray[Any]) -> IntArray:
+    """Returns the memory of an array as integers, shape (rows, words of a row)."""
+    if not array.size:
+        return np.zeros(array.shape[:2], np.int64)
+    bits = array.view(np.int64)
+    assert np.shares_memory(bits, array)
+    return bits if array.dtype.fields is None else bits.reshape(len(array), -1)
+
+
+def _list_memory_sources(site: Site) -> IntArray:
+    """Returns where the numbers of the field `mem` are, see `SiteViews.memory`.
+
+    The order is that of `Site.restore_state`.
+    """
+    sources: list[tuple[int, int, int]] = []
+    parts = site.parts
+    site_type = site.arrays.site.dtype
+    link_type = site.arrays.links.dtype
+
+    def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
+        """Adds the numbers of a field of a row."""
+        assert dtype.fields is not None
+        field_type, offset = dtype.fields[field][:2]
+        first = (row * dtype.itemsize + offset) // _WORD_BYTES
+        is_integer = int(field_type.base.kind == "i")
+        bits = range(first, first + field_type.itemsize // _WORD_BYTES)
+        sources.extend((int(dtype is link_type), word, is_integer) for word in bits)
+
+    add(site_type, "q_held")
+    add(site_type, "return_from_ns")
+    if parts.glides:
+        add(site_type, "qd_held")
+        add(site_type, "reason")
+        for p in range(len(site.peers)):
+            add(link_type, "used_ns", p)
+        add(site_type, "tau_held")
+        if site.layout.task:
+            add(site_type, "q_rest")
+            add(site_type, "qd_rest")
+        if parts.degrades:
+            for p in range(len(site.peers)):
+                add(link_type, "gone", p)
+    return np.array(sources, np.int64).reshape(-1, 3)

@@ -1,0 +1,96 @@
+"""Loads numbers from arrays of bytes in compiled code.
+
+Invariant:
+    - The caller makes sure that the eight bytes of a word lie within the array.
+    - All words are signed 64-bit integers, because Numba converts a sum of signed and unsigned
+      numbers to a floating-point number.
+"""
+
+import sys
+from typing import Any
+
+import numba
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.extending import intrinsic
+
+_config: Any = numba.config
+_WORD_BYTES = 8
+_SIGN = 1 << 63
+
+
+def _generate_load(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    """Generates the load of eight bytes at any place of an array of bytes."""
+    data, offset = args
+    array = context.make_array(signature.args[0])(context, builder, data)
+    pointer = builder.gep(array.data, [offset])
+    word_pointer = builder.bitcast(pointer, ir.IntType(64).as_pointer())
+    return builder.load(word_pointer, align=1)
+
+
+@intrinsic
+def _load_compiled(_context: Any, data: Any, _place: Any) -> Any:
+    """Generates the load of a word in the byte order of the processor."""
+    return types.int64(data, types.intp), _generate_load
+
+
+@intrinsic
+def _load_swapped(_context: Any, data: Any, _place: Any) -> Any:
+    """Generates the load of a word in the other byte order."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bswap(_generate_load(context, builder, signature, args))
+
+    return types.int64(data, types.intp), generate
+
+
+@intrinsic
+def _copy_compiled(
+    _context: Any, source: Any, _place: Any, target: Any, _first: Any, _length: Any
+) -> Any:
+    """Generates the copy of some bytes from one array to another."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        source_data, offset, target_data, first, length = args
+        source_array = context.make_array(signature.args[0])(context, builder, source_data)
+        target_array = context.make_array(signature.args[2])(context, builder, target_data)
+        source_pointer = builder.gep(source_array.data, [offset])
+        target_pointer = builder.gep(target_array.data, [first])
+        copy: Any = cgutils.raw_memcpy
+        copy(builder, target_pointer, source_pointer, length, 1)
+        return context.get_dummy_value()
+
+    return types.none(source, types.intp, target, types.intp, types.intp), generate
+
+
+def _copy_plain(source: Any, offset: int, target: Any, first: int, length: int) -> None:
+    """Copies some bytes if Numba is disabled."""
+    target[first : first + length] = source[offset : offset + length]
+
+
+def _load_plain(data: Any, offset: int, byte_order: Any) -> int:
+    """Loads a word if Numba is disabled."""
+    word = int.from_bytes(bytes(data[offset : offset + _WORD_BYTES]), byte_order)
+    return (word ^ _SIGN) - _SIGN  # the same bits as a signed number
+
+
+def _load_plain_little(data: Any, offset: int) -> int:
+    return _load_plain(data, offset, "little")
+
+
+def _load_plain_big(data: Any, offset: int) -> int:
+    return _load_plain(data, offset, "big")
+
+
+_is_little = sys.byteorder == "little"
+_little: Any = _load_compiled if _is_little else _load_swapped
+_big: Any = _load_swapped if _is_little else _load_compiled
+load_little: Any = _load_plain_little if _config.DISABLE_JIT else _little
+"""Loads the word at a place of an array, least byte first: `load_little(data, offset)`."""
+load_big: Any = _load_plain_big if _config.DISABLE_JIT else _big
+"""Loads the word at a place of an array, most significant byte first: `load_big(data, offset)`.
+"""
+copy_bytes: Any = _copy_plain if _config.DISABLE_JIT else _copy_compiled
+"""Copies bytes between arrays that do not overlap: `copy_bytes(source, offset, target, first,
+length)`.
+"""

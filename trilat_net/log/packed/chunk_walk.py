@@ -1,0 +1,163 @@
+"""Finds the messages in an unpacked chunk of an MCAP file, and copies their payloads.
+
+Invariant:
+    - The walk stops before everything but a complete message of a known channel, or a record
+      that a reader ignores. The caller reads the rest as it reads any other file.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.step.jit import leaf
+from ..mcap_records import DEFINITIONS, MESSAGE_HEAD, OP_MESSAGE, RECORD_HEAD_BYTES
+from .byte_words import copy_bytes, load_little
+from .packed_messages import Bytes, Ints
+
+_SCHEMA, _CHANNEL = map(int, DEFINITIONS)
+_MESSAGE_HEAD_BYTES = MESSAGE_HEAD.size
+# Places in the head of a message: the channel comes first.
+_LOG_TIME = 6
+_PUBLISH_TIME = _LOG_TIME + 8
+
+CAPACITY = 1 << 13
+"""Largest number of messages that one walk finds."""
+MOST_CHANNELS = 1 << 16
+"""Number of channels that the head of a message can state."""
+
+WALKED = 0
+"""The walk ended at the end of the chunk, or after `CAPACITY` messages."""
+AT_DEFINITION = 1
+"""The walk ended at a record that defines a schema or a channel."""
+AT_UNKNOWN = 2
+"""The walk ended at an incomplete record, or at a message of an unknown channel."""
+
+
+class MessageRun(NamedTuple):
+    """Messages that a walk through a chunk found, and sums over the messages of each channel.
+
+    A channel has a slot, a small number. The arrays have one entry per message, or one entry
+    per slot.
+
+    Attributes:
+        slots: Slot of each message's channel.
+        begins: Place of the payload's first byte in the chunk.
+        ends: Place after its last byte.
+        log_ns: Time of arrival at the recorder, in Unix time, in ns, as a signed number.
+        publish_ns: Time of sending, in the same form.
+        counts: Number of messages, per slot.
+        lengths: Sum of the lengths of the messages with their heads, per slot, in bytes.
+        excess: Sum of the lengths beyond a limit, per slot, in bytes.
+        firsts: Number of the first message, per slot with messages.
+    """
+
+    slots: NDArray[np.int32]
+    begins: Ints
+    ends: Ints
+    log_ns: Ints
+    publish_ns: Ints
+    counts: Ints
+    lengths: Ints
+    excess: Ints
+    firsts: Ints
+
+
+def allocate_run(slots: int, messages: int = 1) -> MessageRun:
+    """Returns arrays for the messages of one walk.
+
+    Args:
+        slots: Number of slots.
+        messages: Largest number of messages.
+    """
+    places = [np.zeros(messages, np.int64) for _ in range(4)]
+    sums = [np.zeros(slots, np.int64) for _ in range(4)]
+    return MessageRun(np.zeros(messages, np.int32), *places, *sums)
+
+
+@leaf
+def walk_messages(
+    data: Bytes, offset: int, slot_of_channel: NDArray[np.int32], long_bytes: int, run: Any
+) -> tuple[int, int, int]:
+    """Finds messages in an unpacked chunk, from a place on.
+
+    Args:
+        data: The unpacked chunk.
+        offset: Offset of the first record to read.
+        slot_of_channel: Slot of each channel, by its number. -1 for an unknown channel.
+        long_bytes: Length beyond which the bytes of a message count as excess.
+        run: `MessageRun` that receives the messages. Its sums are increased.
+
+    Returns:
+        The number of messages, the place of the next record, and the reason why the walk
+        ended.
+    """
+    size = data.shape[0]
+    count = 0
+    while offset < size and count < run.slots.shape[0]:
+        begin = offset + RECORD_HEAD_BYTES
+        if begin > size:
+            return count, offset, AT_UNKNOWN
+        length = load_little(data, offset + 1)
+        if length < 0 or length > size - begin:
+            return count, offset, AT_UNKNOWN
+        opcode = data[offset]
+        if opcode == OP_MESSAGE:
+            if length < _MESSAGE_HEAD_BYTES:
+                return count, offset, AT_UNKNOWN
+            channel = int(data[begin]) + 256 * int(data[begin + 1])
+            slot = slot_of_channel[channel]
+            if slot < 0:
+                return count, offset, AT_UNKNOWN
+            run.slots[count] = slot
+            run.begins[count] = begin + _MESSAGE_HEAD_BYTES
+            run.ends[count] = begin + length
+            run.log_ns[count] = load_little(data, begin + _LOG_TIME)
+            run.publish_ns[count] = load_little(data, begin + _PUBLISH_TIME)
+            if run.counts[slot] == 0:
+                run.firsts[slot] = count
+            run.counts[slot] += 1
+            run.lengths[slot] += length
+            run.excess[slot] += max(0, length - long_bytes)
+            count += 1
+        elif opcode in (_SCHEMA, _CHANNEL):
+            return count, offset, AT_DEFINITION
+        offset = begin + length
+    return count, offset, WALKED
+
+
+@leaf
+def copy_payloads(
+    data: Bytes,
+    count: int,
+    slot: int,
+    run: Any,
+    payloads: Bytes,
+    offset: int,
+    ends: Ints,
+    times: Ints,
+) -> None:
+    """Copies the payloads of one channel from a chunk.
+
+    Args:
+        data: The unpacked chunk.
+        count: Number of messages that the walk found.
+        slot: Slot of the channel.
+        run: The messages that the walk found.
+        payloads: Receives the payloads one after another.
+        offset: Offset of the first byte in `payloads`.
+        ends: Receives the place after each payload in `payloads`.
+        times: Receives the times of arrival and of sending, shape (2, messages).
+    """
+    number = 0
+    for n in range(count):
+        if run.slots[n] != slot:
+            continue
+        begin = run.begins[n]
+        length = run.ends[n] - begin
+        copy_bytes(data, begin, payloads, offset, length)
+        offset += length
+        ends[number] = offset
+        times[0, number] = run.log_ns[n]
+        times[1, number] = run.publish_ns[n]
+        number += 1

@@ -1,0 +1,303 @@
+"""Gives access to the fields of many records of a site as arrays, by compiled code.
+
+Invariant:
+    - All records have the exact layout that this program writes. Otherwise there is no
+      `IndexedRecords`, and the records are decoded by `record_columns`.
+    - The arrays equal those of `record_columns`, bit for bit.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.step.vectors import Array
+from ...net.messages import MODE_WORDS
+from ...records import Layout
+from . import record_scan
+from .packed_messages import Ints, PackedMessages
+from .record_layout import (
+    BEFORE_BUSY,
+    BEFORE_SENT,
+    FIRST_VECTOR,
+    NUMBER_BYTES,
+    RecordLayout,
+    make_record_layout,
+)
+
+_INTS = {
+    "t_ns": (record_scan.TIME, ()),
+    "rx_crc": (record_scan.CRC, ()),
+    "late_us": (record_scan.LATE, ()),
+    "busy_us": (record_scan.LATE, (BEFORE_BUSY,)),
+    "sent_ns": (record_scan.LATE, (BEFORE_BUSY, BEFORE_SENT)),
+}
+"""Integer fields: the mark before a field, and the literals between the mark and the field."""
+_TICK, _BOOT, _MODE = range(3)
+"""Columns of the heads, see `record_scan.scan_records`."""
+
+
+class IndexedRecords:
+    """Records of a site that have the exact layout, with the places of their values.
+
+    `index_records` creates this object. K is the number of records.
+
+    Args:
+        messages: The encoded records.
+        peers: Names of the site's peers.
+        layout: Lengths of the vectors of a record.
+        exact: The exact layout.
+        heads: Tick, boot and mode of each record, shape (K, 3).
+        marks: Places of values in each record, shape (K, MARKS).
+        counts: Lengths of lists in each record, shape (K, COUNTS).
+
+    Attributes:
+        messages: See above.
+    """
+
+    def __init__(
+        self,
+        messages: PackedMessages,
+        peers: Sequence[str],
+        layout: Layout,
+        exact: RecordLayout,
+        heads: Ints,
+        marks: NDArray[np.int32],
+        counts: NDArray[np.int32],
+    ) -> None:
+        self.messages = messages
+        self._peers = peers
+        self._layout = layout
+        self._exact = exact
+        self._heads = heads
+        self._marks = marks
+        self._counts = counts
+
+    def __len__(self) -> int:
+        return len(self.messages)
+
+    def select(self, rows: Ints | slice) -> "IndexedRecords":
+        """Returns some of the records, or all of them in another order.
+
+        Args:
+            rows: Indices of the records, or a slice.
+        """
+        return IndexedRecords(
+            messages=self.messages.select(rows),
+            peers=self._peers,
+            layout=self._layout,
+            exact=self._exact,
+            heads=self._heads[rows],
+            marks=self._marks[rows],
+            counts=self._counts[rows],
+        )
+
+    @property
+    def ticks(self) -> Ints:
+        """Tick of each record, shape (K,)."""
+        return np.ascontiguousarray(self._heads[:, _TICK])
+
+    @property
+    def boots(self) -> Ints:
+        """Boot of each record, shape (K,), as a signed number with the same bits."""
+        return self._heads[:, _BOOT]
+
+    @property
+    def mode_codes(self) -> Ints:
+        """Number of the mode in each record, shape (K,), see `Mode`."""
+        return self._heads[:, _MODE]
+
+    @property
+    def modes(self) -> NDArray[np.object_]:
+        """Name of the mode in each record, shape (K,)."""
+        bits = np.empty(max(map(int, MODE_WORDS)) + 1, np.object_)
+        for mode, word in MODE_WORDS.items():
+            bits[int(mode)] = word
+        return bits[self.mode_codes]
+
+    def ints(self, field: str) -> Ints:
+        """Returns an integer field of each record, shape (K,).
+
+        Args:
+            field: Name of the field, one of `_INTS`.
+        """
+        mark, literals = _INTS[field]
+        gaps = [0, *self._exact.lengths[list(literals)].tolist()]
+        return np.ascontiguousarray(self._gather_ints(mark, gaps)[:, -1])
+
+    def has_ints(self, field: str) -> bool:
+        """True if `ints` returns a field."""
+        return field in _INTS
+
+    def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
+        """Returns integers that follow a mark, shape (K, number of gaps)."""
+        numbers = np.zeros((len(self), len(gaps)), np.int64)
+        record_scan.gather_ints(
+            self.messages.data,
+            self.messages.starts,
+            self._marks[:, mark],
+            np.array(gaps, np.int64),
+            numbers,
+        )
+        return numbers
+
+    @property
+    def used(self) -> Ints:
+        """Tick of the sample of each peer that was in use, shape (K, P) for P peers."""
+        peers = self._exact.peers
+        lengths = self._exact.lengths
+        return self._gather_ints(record_scan.USED, lengths[len(lengths) - peers :].tolist())
+
+    def vector_words(self, fields: Sequence[str]) -> Ints:
+        """Returns the bits of all numbers of some vectors, shape (K, numbers).
+
+        Args:
+            fields: Names of the vectors. The records must have all of them.
+        """
+        groups: dict[int, list[int]] = {record_scan.VECTORS: [], record_scan.OPTIONAL: []}
+        columns: dict[int, list[int]] = {record_scan.VECTORS: [], record_scan.OPTIONAL: []}
+        places = self._vector_places()
+        width = 0
+        for field in fields:
+            mark, first, count = places[field]
+            groups[mark] += range(first, first + count * NUMBER_BYTES, NUMBER_BYTES)
+            columns[mark] += range(width, width + count)
+            width += count
+        parts = {
+            mark: self._gather_floats(mark, group) for mark, group in groups.items() if group
+        }
+        if len(parts) == 1:
+            [only] = parts.values()
+            return only
+        bits = np.zeros((len(self), width), np.int64)
+        for mark, part in parts.items():
+            bits[:, columns[mark]] = part
+        return bits
+
+    def _gather_floats(self, mark: int, places: Sequence[int]) -> Ints:
+        """Returns the bits of numbers at fixed places after a mark, shape (K, numbers)."""
+        bits = np.zeros((len(self), len(places)), np.int64)
+        record_scan.gather_floats(
+            self.messages.data,
+            self.messages.starts,
+            self._marks[:, mark],
+            np.array(places, np.int64),
+            bits,
+        )
+        return bits
+
+    def _vector_places(self) -> dict[str, tuple[int, int, int]]:
+        """Returns the mark, the place after the mark, and the length of each vector."""
+        exact = self._exact
+        names = list(self._layout.lengths())
+        first_optional = len(exact.vectors)
+        counts = [*exact.vectors.tolist(), *exact.optional_vectors.tolist()]
+        places = {}
+        offset = 0
+        for n, (name, count) in enumerate(zip(names, counts, strict=True)):
+            if n == first_optional:
+                offset = 0
+            mark = record_scan.VECTORS if n < first_optional else record_scan.OPTIONAL
+            offset += int(exact.lengths[FIRST_VECTOR + n])
+            places[name] = (mark, offset, count)
+            offset += count * NUMBER_BYTES
+        return places
+
+    def vectors(self, fields: Sequence[str]) -> dict[str, Array]:
+        """Returns some vectors of each record.
+
+        Args:
+            fields: Names of the vectors.
+
+        Returns:
+            For each field an array of shape (K, length). The length is 0 for a field that
+            these records do not have.
+        """
+        lengths = self._layout.lengths()
+        vectors = {}
+        for field in fields:
+            if field in lengths:
+                vectors[field] = self.vector_words([field]).view(np.float64)
+            else:
+                vectors[field] = np.zeros((len(self), 0))
+        return vectors
+
+    @property
+    def arrivals(self) -> tuple[Ints, Ints]:
+        """Number of arrivals of each record, shape (K,), and all N arrivals, shape (N, 3)."""
+        counts = self._counts[:, record_scan.ARRIVAL_COUNT].astype(np.int64)
+        numbers = np.zeros((int(counts.sum()), 3), np.int64)
+        record_scan.gather_stamps(
+            self.messages.data,
+            self.messages.starts,
+            self._marks[:, record_scan.ARRIVALS],
+            counts,
+            numbers,
+        )
+        return counts, numbers
+
+    @property
+    def change_counts(self) -> NDArray[np.int32]:
+        """Number of texts in the field `cmd` of each record, shape (K,)."""
+        return self._counts[:, record_scan.CHANGE_COUNT]
+
+    @property
+    def memory_words(self) -> tuple[Ints, Ints]:
+        """Length of the field `mem` in each record, shape (K,), and the bits of all numbers."""
+        counts = self._counts[:, record_scan.MEMORY_COUNT].astype(np.int64)
+        bits = np.zeros(int(counts.sum()), np.int64)
+        record_scan.gather_memories(
+            self.messages.data,
+            self.messages.starts,
+            self._marks[:, record_scan.MEMORY],
+            counts,
+            bits,
+        )
+        return counts, bits
+
+    @property
+    def memories(self) -> NDArray[np.object_]:
+        """Field `mem` of each record as a list of numbers, shape (K,)."""
+        counts, bits = self.memory_words
+        numbers = bits.view(np.float64).tolist()
+        lists = np.empty(len(self), np.object_)
+        first = 0
+        for k, count in enumerate(counts.tolist()):
+            lists[k] = numbers[first : first + count]
+            first += count
+        return lists
+
+
+def index_records(
+    payloads: PackedMessages, site: str, peers: Sequence[str], layout: Layout
+) -> IndexedRecords | None:
+    """Finds the places of the values in records that have the exact layout.
+
+    Args:
+        payloads: The encoded records.
+        site: Name of the site that sent them.
+        peers: Names of its peers, in the order of the scenario.
+        layout: Lengths of the vectors of a record.
+
+    Returns:
+        The records. None if a record has another layout, or is not valid.
+    """
+    exact = make_record_layout(site, peers, layout)
+    count = len(payloads)
+    heads = np.zeros((count, 3), np.int64)
+    marks = np.zeros((count, record_scan.MARKS), np.int32)
+    counts = np.zeros((count, record_scan.COUNTS), np.int32)
+    accepted = record_scan.scan_records(
+        payloads.data, payloads.starts, payloads.ends, exact, heads, marks, counts
+    )
+    if accepted < count:
+        return None
+    return IndexedRecords(
+        messages=payloads,
+        peers=peers,
+        layout=layout,
+        exact=exact,
+        heads=heads,
+        marks=marks,
+        counts=counts,
+    )

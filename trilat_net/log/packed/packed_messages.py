@@ -1,0 +1,86 @@
+"""Stores the encoded messages of a channel one after another in one block of bytes."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+
+PADDING = 16
+"""Number of bytes after the last message, so that eight bytes can be loaded at every place of a
+message, and after the head of a number at its end.
+"""
+
+
+class PackedMessages(Sequence[bytes]):
+    """Read-only sequence of encoded messages, which are created as `bytes` when accessed.
+
+    Args:
+        data: The messages, followed by `PADDING` bytes.
+        starts: Place of the first byte of each of the K messages, shape (K,).
+        ends: Place after the last byte of each message, shape (K,).
+
+    Attributes:
+        data: The bytes of all messages.
+        starts: See above.
+        ends: See above.
+    """
+
+    def __init__(self, data: Bytes, starts: Ints, ends: Ints) -> None:
+        # Compiled code exists only for bytes that cannot be changed.
+        self.data = data.view()
+        self.data.setflags(write=False)
+        self.starts = starts
+        self.ends = ends
+
+    @classmethod
+    def pack(cls, payloads: Sequence[bytes]) -> "PackedMessages":
+        """Stores messages in one block of bytes.
+
+        Args:
+            payloads: The encoded messages. Packed messages are returned unchanged.
+        """
+        if isinstance(payloads, PackedMessages):
+            return payloads
+        data = np.frombuffer(b"".join([*payloads, bytes(PADDING)]), np.uint8)
+        ends = np.cumsum(np.fromiter(map(len, payloads), np.int64, len(payloads)))
+        starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(payloads)]
+        return cls(data, starts, ends)
+
+    def select(self, rows: Ints | slice) -> "PackedMessages":
+        """Returns some of the messages, in any order. Their bytes are not copied.
+
+        Args:
+            rows: Index of each message in this sequence, or a slice.
+        """
+        return PackedMessages(self.data, self.starts[rows], self.ends[rows])
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def __iter__(self) -> Iterator[bytes]:
+        view = self.data.data
+        for start, end in zip(self.starts.tolist(), self.ends.tolist(), strict=True):
+            yield view[start:end].tobytes()
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[bytes]: ...
+    def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
+        if isinstance(index, slice):
+            return list(self.select(index))
+        number = range(len(self))[index]  # raises IndexError, and resolves negative indices
+        return self.data[self.starts[number] : self.ends[number]].tobytes()
+
+    def __eq__(self, other: Any) -> bool:
+        if not isinstance(other, Sequence):
+            return NotImplemented
+        return len(self) == len(other) and all(
+            mine == theirs for mine, theirs in zip(self, other, strict=True)
+        )
+
+    __hash__ = None  # type: ignore[assignment] # equal to lists, which have no hash

@@ -1,0 +1,450 @@
+"""Checks encoded records against the exact layout, and finds the places of their values.
+
+Invariant:
+    - A record is accepted only if the decoder of whole records accepts it too, with the same
+      values.
+    - A record with another order of fields, another version, or an unusual value is not
+      accepted, even if it is valid.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.step.jit import leaf, loop_leaf
+from ...net.wire import MAX_BYTES
+from ...records import MAX_JOINTS, MAX_LAW_MEMORY
+from .byte_words import load_big, load_little
+from .packed_messages import Bytes, Ints
+from .record_layout import (
+    BEFORE_ARRIVALS,
+    BEFORE_BOOT,
+    BEFORE_BUSY,
+    BEFORE_CHANGES,
+    BEFORE_CRC,
+    BEFORE_ECHO,
+    BEFORE_LATE,
+    BEFORE_MEMORY,
+    BEFORE_MODE,
+    BEFORE_SENT,
+    BEFORE_TICK,
+    BEFORE_TIME,
+    BEFORE_USED,
+    FIRST_VECTOR,
+    NUMBER_BYTES,
+)
+
+# Columns of the marks of a record: the place of a value, from the first byte of the record.
+TIME, VECTORS, USED, ARRIVALS, CRC, MEMORY, LATE, OPTIONAL = range(8)
+MARKS = 8
+"""Number of the marks of a record."""
+# Columns of the counts of a record.
+ARRIVAL_COUNT, CHANGE_COUNT, MEMORY_COUNT = range(3)
+COUNTS = 3
+"""Number of the counts of a record."""
+
+_NOT_ACCEPTED = -1
+_MOST_TICKS = 1 << 40
+_MOST_INSTANT = 1 << 59
+_MOST_MEMORY = MAX_JOINTS + 1 + MAX_LAW_MEMORY
+_EXPONENT = 0x7FF << 52
+"""Bits of a floating-point number that are all set if the number is not finite."""
+_FLOAT = 0xCB
+_SHORT_MAP, _SHORT_LIST, _SHORT_TEXT, _FIRST_WORD = 0x80, 0x90, 0xA0, 0xC0
+_TEXT_8, _TEXT_16, _LIST_16, _LIST_32 = 0xD9, 0xDA, 0xDC, 0xDD
+_UNSIGNED, _SIGNED, _NEGATIVE = 0xCC, 0xD0, 0xE0
+
+
+def _list_sizes() -> NDArray[np.int64]:
+    """Returns the length of an encoded integer by its first byte. 0 if it is no integer."""
+    sizes = np.zeros(256, np.int64)
+    sizes[:_SHORT_MAP] = 1
+    sizes[_NEGATIVE:] = 1
+    for n, size in enumerate((2, 3, 5, 9)):
+        sizes[_UNSIGNED + n] = size
+        sizes[_SIGNED + n] = size
+    return sizes
+
+
+_SIZES = _list_sizes()
+
+
+@leaf
+def _read_int(data: Bytes, offset: int) -> int:
+    """Returns the encoded integer at a place. One of 2^63 or more has the sign changed."""
+    first = int(data[offset])
+    if first < _SHORT_MAP:
+        return first
+    if first >= _NEGATIVE:
+        return first - 256
+    unused_bits = 72 - 8 * _SIZES[first]
+    word = load_big(data, offset + 1)
+    value: int = word >> unused_bits
+    if first < _SIGNED and unused_bits > 0:
+        value &= (1 << (64 - unused_bits)) - 1
+    return value
+
+
+@leaf
+def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
+    """Returns the place after a literal. -1 if the record has other bytes there."""
+    after: int = offset + layout.lengths[literal]
+    if after > end:
+        return _NOT_ACCEPTED
+    difference = 0
+    first = layout.first_words[literal]
+    for n in range(first, layout.first_words[literal + 1]):
+        word = load_little(data, offset + 8 * (n - first))
+        difference |= (word ^ layout.bits[n]) & layout.masks[n]
+    return _NOT_ACCEPTED if difference != 0 else after
+
+
+@leaf
+def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
+    """Returns the place of the integer after a literal. -1 if there is no whole integer."""
+    offset = _after_literal(data, offset, end, literal, layout)
+    if offset < 0 or offset >= end:
+        return _NOT_ACCEPTED
+    size = _SIZES[data[offset]]
+    if size == 0 or offset + size > end:
+        return _NOT_ACCEPTED
+    # An unsigned number of 2^63 or more does not fit into a column.
+    if size == NUMBER_BYTES and data[offset] < _SIGNED and data[offset + 1] >= _SHORT_MAP:
+        return _NOT_ACCEPTED
+    return offset
+
+
+@leaf
+def _list_count(data: Bytes, offset: int, end: int) -> int:
+    """Returns the number of items of the list at a place. -1 if there is no list."""
+    if offset < 0 or offset >= end:
+        return _NOT_ACCEPTED
+    first = int(data[offset])
+    if _SHORT_LIST <= first < _SHORT_TEXT:
+        return first - _SHORT_LIST
+    if first == _LIST_16 and offset + 3 <= end:
+        return 256 * int(data[offset + 1]) + int(data[offset + 2])
+    return _NOT_ACCEPTED
+
+
+@leaf
+def _list_head_bytes(data: Bytes, offset: int) -> int:
+    """Returns the length of the head of the list at a place."""
+    return 3 if data[offset] == _LIST_16 else 1
+
+
+@leaf
+def _after_floats(data: Bytes, offset: int, end: int, count: int) -> int:
+    """Returns the place after some finite floating-point numbers. -1 if there are others."""
+    after = offset + NUMBER_BYTES * count
+    if after > end:
+        return _NOT_ACCEPTED
+    wrong = 0
+    for n in range(count):
+        number = offset + NUMBER_BYTES * n
+        word = load_big(data, number + 1)
+        wrong |= (data[number] != _FLOAT) | ((word & _EXPONENT) == _EXPONENT)
+    return _NOT_ACCEPTED if wrong else after
+
+
+@leaf
+def _after_vectors(
+    data: Bytes, offset: int, end: int, first: int, vectors: Ints, layout: Any
+) -> int:
+    """Returns the place after some vectors with their literals. -1 if they are not there."""
+    for n in range(vectors.shape[0]):
+        offset = _after_literal(data, offset, end, first + n, layout)
+        if offset >= 0:
+            offset = _after_floats(data, offset, end, vectors[n])
+        if offset < 0:
+            return _NOT_ACCEPTED
+    return offset
+
+
+@leaf
+def _after_stamps(data: Bytes, offset: int, end: int) -> int:
+    """Returns the place after a list of arrivals. -1 if there is no such list."""
+    count = _list_count(data, offset, end)
+    if count < 0:
+        return _NOT_ACCEPTED
+    offset += _list_head_bytes(data, offset)
+    for _ in range(count):
+        if offset >= end or data[offset] != _SHORT_LIST + 3:
+            return _NOT_ACCEPTED
+        offset += 1
+        for _ in range(3):
+            if offset >= end:
+                return _NOT_ACCEPTED
+            size = _SIZES[data[offset]]
+            if size == 0 or offset + size > end:
+                return _NOT_ACCEPTED
+            value = _read_int(data, offset)
+            is_huge = size == NUMBER_BYTES and data[offset] < _SIGNED and value < 0
+            if is_huge or value < -_MOST_INSTANT or value >= _MOST_INSTANT:
+                return _NOT_ACCEPTED
+            offset += size
+    return offset
+
+
+@leaf
+def _after_texts(data: Bytes, offset: int, end: int) -> int:
+    """Returns the place after a list of texts in ASCII. -1 if there is no such list."""
+    count = _list_count(data, offset, end)
+    if count < 0:
+        return _NOT_ACCEPTED
+    offset += _list_head_bytes(data, offset)
+    for _ in range(count):
+        if offset >= end:
+            return _NOT_ACCEPTED
+        first = int(data[offset])
+        if _SHORT_TEXT <= first < _FIRST_WORD:
+            length = first - _SHORT_TEXT
+            offset += 1
+        elif first == _TEXT_8 and offset + 2 <= end:
+            length = int(data[offset + 1])
+            offset += 2
+        elif first == _TEXT_16 and offset + 3 <= end:
+            length = 256 * int(data[offset + 1]) + int(data[offset + 2])
+            offset += 3
+        else:
+            return _NOT_ACCEPTED
+        if offset + length > end:
+            return _NOT_ACCEPTED
+        for n in range(length):
+            if data[offset + n] >= _SHORT_MAP:
+                return _NOT_ACCEPTED
+        offset += length
+    return offset
+
+
+@leaf
+def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
+    """Returns the index of the mode whose name is at a place. -1 if there is none."""
+    if offset < 0 or offset >= end:
+        return _NOT_ACCEPTED
+    length = int(data[offset]) - _SHORT_TEXT
+    if length < 1 or length > 8 or offset + 1 + length > end:
+        return _NOT_ACCEPTED
+    word = load_little(data, offset + 1)
+    for n in range(layout.modes.shape[0]):
+        mask = layout.modes[n, 1]
+        # The mask of a shorter name would accept a longer one.
+        if (word & mask) == layout.modes[n, 0] and _mask_bytes(mask) == length:
+            return n
+    return _NOT_ACCEPTED
+
+
+@leaf
+def _mask_bytes(mask: int) -> int:
+    """Returns the number of bytes that a mask selects, from the least byte on."""
+    count = 0
+    while count < 8 and (mask >> (8 * count)) & 1:
+        count += 1
+    return count
+
+
+@leaf
+def _scan_record(
+    data: Bytes, start: int, end: int, layout: Any, heads: Ints, marks: Any, counts: Any
+) -> bool:
+    """Checks one record, and finds the places of its values, see `scan_records`."""
+    offset = _after_literal(data, start, end, BEFORE_BOOT, layout)
+    if offset < 0 or offset >= end:
+        return False
+    size = _SIZES[data[offset]]
+    # The boot is the only number that may be 2^63 or more.
+    if size == 0 or offset + size > end:
+        return False
+    boot = _read_int(data, offset)
+    is_unsigned = data[offset] < _SIGNED
+    if boot < 0 and not is_unsigned:
+        return False
+    heads[1] = boot
+    offset = _int_after(data, offset + size, end, BEFORE_TICK, layout)
+    if offset < 0:
+        return False
+    heads[0] = _read_int(data, offset)
+    if heads[0] < 0 or heads[0] >= _MOST_TICKS:
+        return False
+    offset = _int_after(data, offset + _SIZES[data[offset]], end, BEFORE_TIME, layout)
+    if offset < 0:
+        return False
+    marks[TIME] = offset - start
+    offset = _after_literal(data, offset + _SIZES[data[offset]], end, BEFORE_MODE, layout)
+    mode = _find_mode(data, offset, end, layout)
+    if mode < 0:
+        return False
+    heads[2] = layout.mode_codes[mode]
+    offset += 1 + int(data[offset]) - _SHORT_TEXT
+    marks[VECTORS] = offset - start
+    offset = _after_vectors(data, offset, end, FIRST_VECTOR, layout.vectors, layout)
+    if offset < 0:
+        return False
+
+    offset = _after_literal(data, offset, end, BEFORE_USED, layout)
+    if offset < 0:
+        return False
+    marks[USED] = offset - start
+    first_peer = FIRST_VECTOR + layout.vectors.shape[0] + layout.optional_vectors.shape[0]
+    for n in range(layout.peers):
+        offset = _int_after(data, offset, end, first_peer + n, layout)
+        if offset < 0:
+            return False
+        offset += _SIZES[data[offset]]
+
+    offset = _after_literal(data, offset, end, BEFORE_ARRIVALS, layout)
+    marks[ARRIVALS] = offset - start
+    counts[ARRIVAL_COUNT] = _list_count(data, offset, end)
+    offset = _after_stamps(data, offset, end)
+    if offset < 0:
+        return False
+    offset = _int_after(data, offset, end, BEFORE_CRC, layout)
+    if offset < 0 or _read_int(data, offset) < 0:
+        return False
+    marks[CRC] = offset - start
+    offset = _after_literal(data, offset + _SIZES[data[offset]], end, BEFORE_CHANGES, layout)
+    counts[CHANGE_COUNT] = _list_count(data, offset, end)
+    offset = _after_texts(data, offset, end)
+    if offset < 0:
+        return False
+    offset = _after_literal(data, offset, end, BEFORE_MEMORY, layout)
+    memory = _list_count(data, offset, end)
+    if memory < 0 or memory > _MOST_MEMORY:
+        return False
+    counts[MEMORY_COUNT] = memory
+    offset += _list_head_bytes(data, offset)
+    marks[MEMORY] = offset - start
+    offset = _after_floats(data, offset, end, memory)
+    if offset < 0:
+        return False
+
+    offset = _int_after(data, offset, end, BEFORE_LATE, layout)
+    if offset < 0:
+        return False
+    marks[LATE] = offset - start
+    offset = _int_after(data, offset + _SIZES[data[offset]], end, BEFORE_BUSY, layout)
+    if offset < 0:
+        return False
+    offset = _int_after(data, offset + _SIZES[data[offset]], end, BEFORE_SENT, layout)
+    if offset < 0:
+        return False
+    sent_ns = _read_int(data, offset)
+    if sent_ns < -_MOST_INSTANT or sent_ns >= _MOST_INSTANT:
+        return False
+    offset = _after_literal(data, offset + _SIZES[data[offset]], end, BEFORE_ECHO, layout)
+    offset = _after_stamps(data, offset, end)
+    if offset < 0:
+        return False
+    marks[OPTIONAL] = offset - start
+    first_optional = FIRST_VECTOR + layout.vectors.shape[0]
+    offset = _after_vectors(data, offset, end, first_optional, layout.optional_vectors, layout)
+    return offset == end
+
+
+@loop_leaf
+def scan_records(
+    data: Bytes, starts: Ints, ends: Ints, layout: Any, heads: Ints, marks: Any, counts: Any
+) -> int:
+    """Checks records, and finds the places of their values.
+
+    Args:
+        data: The records, followed by padding.
+        starts: Place of the first byte of each of the K records, shape (K,).
+        ends: Place after the last byte of each record, shape (K,).
+        layout: The exact layout of the records, a `RecordLayout`.
+        heads: Receives the tick, the boot and the number of the mode of each record, shape
+            (K, 3). A boot of 2^63 or more is stored as the signed number with the same bits.
+        marks: Receives the places of values, see `MARKS`, shape (K, MARKS).
+        counts: Receives the lengths of lists, see `COUNTS`, shape (K, COUNTS).
+
+    Returns:
+        The number of records before the first one that is not accepted.
+    """
+    records: int = starts.shape[0]
+    for k in range(records):
+        start = starts[k]
+        end = ends[k]
+        if end - start > MAX_BYTES:
+            return k
+        if not _scan_record(data, start, end, layout, heads[k], marks[k], counts[k]):
+            return k
+    return records
+
+
+@loop_leaf
+def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints) -> None:
+    """Reads integers that follow each other in each record.
+
+    Args:
+        data: The records, followed by padding.
+        starts: Place of the first byte of each record, shape (K,).
+        marks: Place before the first number from the start of a record, shape (K,).
+        gaps: Number of bytes before each of the N numbers, shape (N,).
+        numbers: Receives the numbers, shape (K, N).
+    """
+    for k in range(starts.shape[0]):
+        offset = starts[k] + marks[k]
+        for n in range(gaps.shape[0]):
+            offset += gaps[n]
+            numbers[k, n] = _read_int(data, offset)
+            offset += _SIZES[data[offset]]
+
+
+@loop_leaf
+def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Ints) -> None:
+    """Reads floating-point numbers at fixed places after a mark, as their bits.
+
+    Args:
+        data: The records, followed by padding.
+        starts: Place of the first byte of each record, shape (K,).
+        marks: Place of the mark from the start of a record, shape (K,).
+        places: Place of each of the N numbers after the mark, shape (N,).
+        bits: Receives the bits of the numbers, shape (K, N).
+    """
+    for k in range(starts.shape[0]):
+        offset = starts[k] + marks[k] + 1
+        for n in range(places.shape[0]):
+            bits[k, n] = load_big(data, offset + places[n])
+
+
+@loop_leaf
+def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
+    """Reads the arrivals of all records.
+
+    Args:
+        data: The records, followed by padding.
+        starts: Place of the first byte of each record, shape (K,).
+        marks: Place of the list of arrivals from the start of a record, shape (K,).
+        counts: Number of arrivals of each record, shape (K,).
+        numbers: Receives the N arrivals in order, shape (N, 3).
+    """
+    row = 0
+    for k in range(starts.shape[0]):
+        offset = starts[k] + marks[k]
+        offset += _list_head_bytes(data, offset)
+        for _ in range(counts[k]):
+            offset += 1
+            for n in range(3):
+                numbers[row, n] = _read_int(data, offset)
+                offset += _SIZES[data[offset]]
+            row += 1
+
+
+@loop_leaf
+def gather_memories(data: Bytes, starts: Ints, marks: Any, counts: Any, bits: Ints) -> None:
+    """Reads the numbers of the field `mem` of all records, as their bits.
+
+    Args:
+        data: The records, followed by padding.
+        starts: Place of the first byte of each record, shape (K,).
+        marks: Place of the first number from the start of a record, shape (K,).
+        counts: Number of numbers in each record, shape (K,).
+        bits: Receives the bits of the N numbers of all records, shape (N,).
+    """
+    row = 0
+    for k in range(starts.shape[0]):
+        offset = starts[k] + marks[k] + 1
+        for n in range(counts[k]):
+            bits[row] = load_big(data, offset + NUMBER_BYTES * n)
+            row += 1
