@@ -61,7 +61,9 @@ def push_in_many_ways(scenario: Scenario, site: str) -> list[Push]:
 
 
 @pytest.mark.parametrize("name", ["live-4g", "live-paper"])
-def test_twins_of_live_log_equal_in_lanes(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_twins_of_live_log_equal_in_lanes(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     log = tn.open_log(GOLDEN / f"{name}.mcap")
     twins = check_both_ways(monkeypatch, lambda: run_twins(log, choose_pushes(log.scenario)))
     assert twins.same
