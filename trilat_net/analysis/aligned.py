@@ -104,18 +104,20 @@ class AlignedRecords(NamedTuple):
 
     @property
     def shared(self) -> Array:
-        """The coordinates that other sites receive from this site.
+        """Coordinates in which the sites follow each other, one row per tick.
 
-        They are the joint angles q, shape (K, n), or in task space the pose x of the end
-        effector, shape (K, m).
+        A site sends them to its peers. They are the joint angles q, shape (K, n), in rad, or in
+        task space the pose x of the end effector, shape (K, m).
         """
         return self.x if self.x.size else self.q
 
     @property
     def shared_rate(self) -> Array:
-        """The time derivative of the coordinates that other sites receive from this site.
+        """Velocity of the coordinates in which the sites follow each other, one row per tick.
 
-        It is qd, shape (K, n), or in task space xd, shape (K, m).
+        Sites follow each other's joint angles, or in task space the positions of their end
+        effectors. The energy terms use this velocity for both cases: it is qd, shape (K, n), in
+        rad/s, or in task space xd, shape (K, m).
         """
         return self.xd if self.x.size else self.qd
 
@@ -126,7 +128,10 @@ class AlignedRecords(NamedTuple):
 
     @property
     def t_s(self) -> Array:
-        """Nominal time of every row, shape (K,), in s."""
+        """Time of every row on the ideal grid of ticks, tick / rate_hz, shape (K,), in s.
+
+        A tick that was computed late has the same time as one that was computed punctually.
+        """
         return self._ticks / self.rate_hz
 
     @property
@@ -139,8 +144,8 @@ class AlignedRecords(NamedTuple):
     def nominal_s(self) -> Array:
         """Planned time of the tick in every row, rounded down to whole nanoseconds.
 
-        The shape is (K,), in s. The simulation compares these times with the start and end of
-        an external torque.
+        The shape is (K,), in s. The simulation compares exactly these times with the start and
+        the end of an external torque. `t_s` is not rounded, and may differ in the last digit.
         """
         time_ns = self._ticks * NS_PER_S // self.rate_hz
         return time_ns.astype(np.float64) * 1e-9
@@ -170,9 +175,10 @@ class AlignedRecords(NamedTuple):
 
     @property
     def known_periods(self) -> Bools:
-        """Marks the tick periods whose first and last tick both have a record.
+        """Marks the tick periods that can be judged: both of their ticks have a record.
 
-        The shape is (K - 1,), because K ticks bound K - 1 periods.
+        Energy changes between two ticks. If a record was lost, the periods before and after its
+        tick are therefore unknown. K ticks bound K - 1 periods, so that the shape is (K - 1,).
         """
         is_known_at_start = self.known[:-1]
         is_known_at_end = self.known[1:]
@@ -180,6 +186,8 @@ class AlignedRecords(NamedTuple):
 
     def known_at_end(self, length_s: float) -> Bools:
         """Marks the rows in the last seconds of the run that are recorded, not interpolated.
+
+        Metrics of the end of a run, such as the last error, use these rows alone.
 
         Args:
             length_s: Length of the interval at the end of the records, in s.
@@ -490,10 +498,11 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """Marks the tick periods in which no interpolated record determines the peer's motion.
+        """Marks the tick periods in which records alone determine the motion of the peer.
 
-        Both the present and the delayed motion of the peer are then known from its records. The
-        shape is (K - 1,), because K ticks bound K - 1 periods.
+        Both its present and its delayed motion must be known. In other periods some record is
+        missing and was interpolated, so that energies that depend on the peer are not judged. K
+        ticks bound K - 1 periods, so that the shape is (K - 1,).
         """
         now = self.now.known
         delayed = self.delayed.known
@@ -509,6 +518,9 @@ _BEFORE_EPOCH_S = -1.0
 
 def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
     """Returns the motion of a peer as a site receives it, with the delay of the link.
+
+    The records of the site say which sample it used in each tick, and the motion of the peer
+    says what this sample contained.
 
     Args:
         records: Records of the site, which name the sample in use at every tick.
@@ -531,6 +543,9 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
     """Finds the last tick of a site at or before each of some times.
+
+    It relates sites whose control loops have different rates: a time of one site is looked up
+    in the records of another one.
 
     Args:
         records: Records of the site, with one row per tick.

@@ -64,13 +64,24 @@ B).
 
 
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
-    """Returns the product of a matrix, shape (a, b, ...), and a vector, shape (b, ...)."""
+    """Multiplies a matrix and a vector, separately for each of many records.
+
+    Args:
+        matrix: Entries of the matrices, shape (a, b, ...). The axes "..." count the records.
+        vector: Components of the vectors, shape (b, ...), with the same records.
+
+    Returns:
+        The products, shape (a, ...).
+    """
     product: Numbers = np.einsum("ab...,b...->a...", matrix, vector)
     return product
 
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
-    """Solves the linear systems A y = b, one for each entry of the trailing axes.
+    """Solves the linear systems A y = b, separately for each of many records.
+
+    The records are counted by the last axes, while NumPy's solver expects them in the first
+    ones.
 
     Args:
         A: Square matrices, shape (m, m, ...).
@@ -112,7 +123,9 @@ class PlacedArm:
     q: Numbers
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), shape (2, 2, ...), in kg m^2.
+        """Returns the inertia matrix M(q), which maps accelerations to torques, in kg m^2.
+
+        The shape is (2, 2, ...), with one matrix per record.
 
         Args:
             theta: The five dynamic parameters of the arm, which combine masses, lengths and
@@ -152,7 +165,10 @@ class PlacedArm:
         return np.array([row_1, row_2])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the torque G(q) that holds the arm against gravity, shape (2, ...), in N m.
+        """Returns the torque G(q) that holds the arm against gravity, in N m.
+
+        It is the gradient of the potential energy with respect to the joint angles. The shape
+        is (2, ...), with one column per record.
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -233,7 +249,12 @@ class PlacedArm:
         return solve_columns(M, torque - bias_torque)
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector from the base, shape (2, ...), in m."""
+        """Returns the position (x, y) of the end effector by forward kinematics, in m.
+
+        For links of the lengths l_1 and l_2, x = l_1 cos q_1 + l_2 cos(q_1 + q_2), and y has
+        sines in place of the cosines. The origin is the first joint. The shape is (2, ...),
+        with one column per record.
+        """
         l1_m, l2_m = self.lengths_m
         inner, q_2 = self.q
         outer = inner + q_2
@@ -242,7 +263,10 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian of the end effector's position, shape (2, 2, ...), in m/rad."""
+        """Returns the Jacobian J of the end effector's position: its velocity is J qd.
+
+        The shape is (2, 2, ...), in m/rad. Rows are x and y, columns are the two joints.
+        """
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
         q_1, q_2 = self.q
@@ -307,14 +331,19 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """Always None, because this arm follows joint by joint, not with its end effector."""
+        """Always None: the planar arm follows other arms joint by joint, never by end effector.
+
+        `ChainArmRows.task` has the settings of arms that do, so that callers need not
+        distinguish the two kinds of arms.
+        """
         return
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
         """Marks the parameters on which the gravity torque depends, shape (5,).
 
-        The entries are True for theta_4 and theta_5, the products of masses and lever arms.
+        The entries are True for theta_4 and theta_5, the products of masses and lever arms. The
+        other parameters describe inertia alone.
         """
         return np.arange(5) >= 3
 
@@ -338,6 +367,8 @@ class PlanarArmRows(NamedTuple):
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
         """Returns the product M(q) x of the inertia matrix and a vector, in each of K poses.
+
+        With velocities, the products are momenta, and with accelerations they are torques.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -406,7 +437,7 @@ class PlanarArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) that holds the arm against gravity, in N m.
+        """Returns the torque G(q) that holds the arm against gravity in K poses, in N m.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -439,7 +470,11 @@ class PlanarArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns zeros, shape (K, 2): this arm has no friction in its joints."""
+        """Returns the friction torques of the joints, which are zero here, shape (K, 2).
+
+        The method exists because `ChainArmRows` has it for chains, whose joints may have
+        friction.
+        """
         return np.zeros_like(speed)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
@@ -616,7 +651,7 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """The coordinates of the end effector with which the arm follows other arms.
+        """Settings of an arm that follows the end effectors of other arms, such as its axes.
 
         None if the arm follows other arms joint by joint.
         """
@@ -635,7 +670,7 @@ class ChainArmRows(NamedTuple):
 
     @property
     def _rows(self) -> RowArray:
-        """The joints in the form that the functions of the kernel expect."""
+        """The joints as the rows that the functions of the simulation kernel read."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:
@@ -806,12 +841,16 @@ class ChainArmRows(NamedTuple):
         return position, J, energy
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the potential energy of the links against the base, shape (K,), in J."""
+        """Returns the energy of the links in the field of gravity, at joint angles `q`.
+
+        Its zero is at the height of the base. `q` has the shape (K, n), and the result the
+        shape (K,), in J.
+        """
         _, _, energy = self._place(q)
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that the joints need to overcome their friction.
+        """Returns the torque that the joints need to overcome their friction, dry and viscous.
 
         Args:
             speed: Joint velocities at K times, shape (K, n) for n joints, in rad/s.
@@ -956,6 +995,9 @@ ArmRows = PlanarArmRows | ChainArmRows
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     """Returns the model of a site's arm, for computations over many poses at once.
 
+    Certificate and metrics evaluate inertia and energy at every record, for which one call per
+    record would be too slow.
+
     Args:
         scenario: The description of the experiment, which defines the arm.
         site: Name of the site, the process that runs the arm.
@@ -974,6 +1016,8 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
 
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     """Returns the positions of the base, the joints and the end effector, for drawing an arm.
+
+    Lines through these points, in their order, are the links.
 
     Args:
         arm: The arm.
@@ -1015,9 +1059,15 @@ def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
 
 
 def upright_axes(chain: ChainSetup) -> Array:
-    """Returns two horizontal unit vectors and the upward one, in the frame of the base.
+    """Returns the axes of a frame that stands upright, for drawings of the arm.
 
-    Their components are the rows of the result, shape (3, 3).
+    A URDF file may mount the base of a chain in any orientation. The direction of gravity shows
+    which way is up. Without gravity, the z axis of the base counts as up.
+
+    Returns:
+        Unit vectors forward, sideways and up as rows, in the frame of the base, shape (3, 3).
+            The product of points, shape (..., 3), and the transpose are the upright
+            coordinates.
     """
     gravity = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(gravity))

@@ -50,7 +50,9 @@ def _find_cycle(link: LinkBase) -> Fraction | None:
 
 
 def find_link_period_s(link: LinkBase) -> float | None:
-    """Returns the period of a link's delay, in s.
+    """Returns the period after which the delay of a link repeats, in s.
+
+    For example, a sinusoidal delay of 0.5 Hz has a period of 2 s.
 
     Args:
         link: Delay model of the link.
@@ -131,7 +133,10 @@ class _DelayPeriod(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True if the analysed period is the true one."""
+        """True if the analysed period is the true one, so that results for it hold for ever.
+
+        False if the analysed period is only nearly the true one, or if there is none.
+        """
         return self.span_s is not None and self.span_s == self.true_s
 
 
@@ -163,6 +168,8 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _De
 def is_ending_trace(link: LinkBase) -> bool:
     """Returns True if a link plays a delay trace that does not start again at its end.
 
+    The delay after this end is not a repetition, so that the link has no period.
+
     Args:
         link: Delay model of the link.
     """
@@ -172,6 +179,8 @@ def is_ending_trace(link: LinkBase) -> bool:
 
 def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     """Returns the delay model of a link that is in force at the end of a scenario.
+
+    The linear analysis of a run belongs to this model, because it concerns the final pose.
 
     Args:
         scenario: Description of the experiment. Its timeline may change the link.

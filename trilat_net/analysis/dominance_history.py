@@ -201,7 +201,11 @@ def list_program_sites(log: Log) -> list[str]:
 
 
 def has_program_hand(scenario: Scenario, site: str) -> bool:
-    """Returns True if a site of a scenario has a hand of kind "own", a program of the user."""
+    """Returns True if a program of the user operates the arm of a site (a hand of kind "own").
+
+    Such a program may react to the motion of the arm. A linearised loop does not contain this
+    reaction, unlike that of an operator whom the scenario describes.
+    """
     return any(isinstance(hand, ProgramHand) for hand in scenario.sites[site].hands)
 
 
@@ -280,7 +284,9 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 class PeerLoss(NamedTuple):
-    """A span of time in which a site continued without a peer that it no longer heard.
+    """Span of time in which a site continued without a peer that it no longer heard.
+
+    The site then follows the remaining peers alone, which changes its dominance factors.
 
     Attributes:
         site: Name of the site.
@@ -297,6 +303,9 @@ class PeerLoss(NamedTuple):
 
 def list_losses(log: Log) -> list[PeerLoss]:
     """Lists when sites continued without a peer that they no longer heard.
+
+    In these times the dominance factors differ from the planned ones, because a site gives the
+    share of the lost peer to the others.
 
     Args:
         log: The log of the run.
@@ -385,6 +394,8 @@ def evaluate_ramps(
     h_s: float,
 ) -> DominanceHistory:
     """Computes dominance factors over time from their start values and their changes.
+
+    A change is a ramp: the factors move linearly to their new values, as in the simulation.
 
     Args:
         start: Factors at the start of the session, shape (P,).
@@ -507,6 +518,9 @@ def left_perron_vector(alpha: Array) -> Array:
 
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
+
+    The stability proof allows arms with different gains if all joints have the same ratio: the
+    weights of the arms in V then balance it.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an

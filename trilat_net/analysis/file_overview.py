@@ -261,7 +261,7 @@ class FileOverview(Result):
     facts: JsonObject
 
     def headline(self) -> str:
-        """Returns the names of the files and the number of their messages, in one line."""
+        """Returns one line such as "run.mcap: 120345 messages", with the paths of all files."""
         channels = self.facts["channels"].values()
         messages = sum(channel["messages"] for channel in channels)
         message_count = count_nouns(messages, "message")
@@ -269,11 +269,19 @@ class FileOverview(Result):
         return f"{paths}: {message_count}"
 
     def to_dict(self) -> JsonObject:
-        """Returns the content as plain values, with the keys of `trilat log info --json`."""
+        """Returns the content of the files, with the keys of `trilat log info --json`.
+
+        For example, the entry "channels" has the number of messages of each channel by its
+        topic.
+        """
         return self.facts
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the channels of the file as a table of plain values, one row for each."""
+        """Returns the channels of the file as a table, one row for each.
+
+        A row contains the topic and all facts about the channel, such as its number of
+        messages.
+        """
         return [
             {"topic": topic, **channel} for topic, channel in self.facts["channels"].items()
         ]
@@ -301,6 +309,9 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
     def report_pass(number: int) -> Progress | None:
         """Returns a function that reports the progress of one of two passes over the files.
+
+        `info` reads the files twice. Both passes together are shown as one progress from 0 to
+        1.
 
         Args:
             number: 0 for the first pass, which covers the first half of the progress, 1 for the

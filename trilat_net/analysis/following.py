@@ -242,7 +242,9 @@ class TaskFollowing:
         return self.compute_joint_torque(rows, y)
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
-        """Returns the joint torque J'f of a force f at the end effector, shape (K, n), in N m.
+        """Returns the joint torque J'f that acts like a force f at the end effector.
+
+        The shape is (K, n), in N m.
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -253,6 +255,8 @@ class TaskFollowing:
 
     def project_torque(self, torque: Array) -> Array:
         """Returns the force at the end effector that corresponds to a joint torque, in N.
+
+        `compute_joint_torque` is the reverse conversion.
 
         Args:
             torque: Joint torque, shape (K, n), in N m.

@@ -62,7 +62,10 @@ class _PredictedDelivery(NamedTuple):
 
     @property
     def lost(self) -> Bools:
-        """True for samples that the link loses, shape (M,)."""
+        """Marks the samples that the delay model of the link loses on purpose, shape (M,).
+
+        A receiver must not expect these samples, so that they do not count as missing.
+        """
         lost: Bools = self.due_ns == LOST
         return lost
 
@@ -166,7 +169,9 @@ class _Arrivals(NamedTuple):
     def first(self) -> "_Arrivals":
         """These arrivals without duplicates: only the first arrival of each sample is kept.
 
-        They are ordered by the number of the sample, which the sender counts from 0.
+        A site uses only the first one, so that statistics of delays must not count a sample
+        twice. The result is ordered by the number of the sample, which the sender counts from
+        0.
         """
         sample, rows = np.unique(self.sample, return_index=True)
         return _Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
@@ -349,12 +354,17 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True if sender and receiver read the same clock, as they run on one machine."""
+        """True if sender and receiver run on one machine and thus read the same clock.
+
+        The text of a link then leaves out its clock, because no offset had to be estimated.
+        """
         return self.bound_max_us == 0 and self.offset_us == 0
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
     """Returns the estimates of a peer's clock that a site made during a session.
+
+    The age of a sample is known only as well as the offset between both clocks.
 
     Args:
         log: The log of the run.
@@ -465,12 +475,16 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link as in scenarios, for example "m1->s" from peer m1 to site s."""
+        """Name of the link as in scenarios: "m1->s" for samples that m1 sends to s."""
         return f"{self.peer}->{self.site}"
 
     @property
     def plain(self) -> bool:
-        """True if the link did nothing but delay every sample by the same time."""
+        """True if the link only delayed every sample by one constant time.
+
+        No sample of such a link was late, missing or lost, so that a line of text says
+        everything about the link.
+        """
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
         return is_as_stated and has_one_constant_delay(self.stated)
@@ -541,7 +555,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Computes mean, standard deviation, percentiles and extremes of some numbers.
+    """Computes mean, standard deviation, percentiles and extremes, for example of the ages.
 
     Args:
         values: The numbers.
@@ -730,7 +744,7 @@ class DelayDistribution(NamedTuple):
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Collects the delays and ages of the samples on every link of a run.
+    """Collects the delays and ages of the samples on every link of a run, for histograms.
 
     Args:
         log: Log of the run.

@@ -90,7 +90,11 @@ MIN_SIGN_CHANGES = 6
 
 
 class Stability(StrEnum):
-    """The stability judgement of a run. The value of each member is the word for people."""
+    """The four judgements of a run. The value of each member is the word for people.
+
+    STABLE needs a proof that the run does not contradict. SETTLED means that the motion came to
+    rest or decays, without a proof. OPEN means that the findings do not decide.
+    """
 
     STABLE = "stable"
     SETTLED = "settled"
@@ -101,7 +105,8 @@ class Stability(StrEnum):
 class EndBehaviour(StrEnum):
     """How the arms move at the end of a run, from the best to the worst behaviour.
 
-    The value of each member is a phrase for the user.
+    The order matters: the worst joint decides about the run. `stability` translates the
+    behaviour to a judgement. The value of each member is a phrase for the user.
     """
 
     CONVERGED = "converged"
@@ -116,9 +121,11 @@ class EndBehaviour(StrEnum):
 
     @property
     def stability(self) -> Stability:
-        """The stability judgement that follows from the behaviour at the end of a run.
+        """The judgement that the motion at the end alone suggests.
 
-        Other knowledge about the run may change it.
+        Arms at rest or with decaying motion give SETTLED, motion without a clear trend gives
+        OPEN, and oscillating, drifting or growing motion gives NOT_STABLE. Other knowledge,
+        such as proofs, may change it in `stability_decision`.
         """
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.SETTLED
@@ -213,7 +220,11 @@ class RunEnd(NamedTuple):
 
     @property
     def phrase(self) -> str:
-        """A phrase for the behaviour at the end, which names errors that stay."""
+        """A phrase for the behaviour at the end, such as "converged" or "growing".
+
+        If the arms rest, but with synchronisation errors above the limit of settled sites, the
+        phrase says that errors stay.
+        """
         has_converged = self.behaviour is EndBehaviour.CONVERGED
         if has_converged and self.end_error_rad > SETTLED_ERROR_RAD:
             return LASTING_ERRORS
@@ -341,6 +352,9 @@ def reduce_to_buckets(
 
 def trace_log(log: Log) -> RunTrace:
     """Reduces a log to the data that are needed to judge the end of the run.
+
+    The reduced data of a long log fit into memory, and simulations without a log produce the
+    same.
 
     Args:
         log: The log of the run.
@@ -816,6 +830,9 @@ def _count_sign_changes(values: Array) -> int:
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     """Groups the sites that follow each other at any time, directly or through further sites.
 
+    Only sites of the same group are expected to agree at the end of a run. For example, m1 and
+    s are in one group with m2 if s follows both masters.
+
     Args:
         scenario: Scenario of the run, with the changes of its dominance factors.
 
@@ -973,6 +990,9 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
     """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
+
+    An arm whose controller does not hold it comes to rest as well, but must not count as
+    stable.
 
     Args:
         scenario: The description of the experiment, with the start poses.

@@ -27,6 +27,8 @@ LARGE_PUSH_SHARE = 0.5
 def list_remarks(log: Log) -> tuple[str, ...]:
     """Lists the conditions of a run that a reader of its judgement should know.
 
+    They do not change the judgement, but may explain it.
+
     Args:
         log: Log of the run.
 

@@ -79,7 +79,10 @@ class RunView:
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
-        """The sites with records, by name."""
+        """The sites with records, by name.
+
+        Metrics of the other sites have a reason in place of a value.
+        """
         runs = {}
         for site, records in align_records(self.log).items():
             runs[site] = SiteRun(
@@ -104,17 +107,23 @@ class RunView:
 
     @cached_property
     def absent(self) -> list[str]:
-        """Names of the sites without records."""
+        """Names of the sites without any record, which a log of a failed session may have."""
         return [site for site in self.log.sites if site not in self.sites]
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """Summaries of all links by name, such as "m1->s" from site m1 to site s."""
+        """Summaries of all links (delays, losses, clocks) by name, computed at first use.
+
+        The name "m1->s" denotes the link from site m1 to site s.
+        """
         return {link.name: link for link in summarise_links(self.log)}
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, TorqueSource]]:
-        """The walls by name, each with its site. "s/1" is the first wall of site s."""
+        """All virtual walls by name, each with the site whose arm can touch it.
+
+        The name "s/1" denotes the first wall of site s. Walls of a site are counted from 1.
+        """
         walls = {}
         for site in self.log.sites:
             for number, wall in enumerate(list_walls(self.scenario.sites[site]), 1):

@@ -55,12 +55,16 @@ def follows_in_task_space(log: Log) -> bool:
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns the torque of operator and environment on the arm, shape (K, n), in N m."""
+    """Returns the torque of operator and environment ON the arm, shape (K, n), in N m.
+
+    The records contain tau_x, which Eq. (8) subtracts and which therefore has the opposite
+    sign.
+    """
     return 0.0 - part.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
 
 
 class JointError(NamedTuple):
-    """The largest error |e| of some records.
+    """The largest error |e| among some records, with its place and time.
 
     Attributes:
         value: The error, in the unit of the shared coordinates.
@@ -102,6 +106,8 @@ def find_largest_error(part: SiteLog, from_s: float = -math.inf) -> JointError |
 def find_error_of_last_second(part: SiteLog) -> JointError | None:
     """Finds the largest error |e| of a site in the last second of its records.
 
+    The last second, rather than the last record, does not miss an oscillation.
+
     Args:
         part: Log of the site.
 
@@ -116,6 +122,8 @@ def find_error_of_last_second(part: SiteLog) -> JointError | None:
 def find_last_error(log: Log) -> JointError | None:
     """Finds the largest error |e| of all sites in the last second of their records.
 
+    It shows whether the arms agree at the end of the run.
+
     Args:
         log: Log of the run.
 
@@ -128,7 +136,14 @@ def find_last_error(log: Log) -> JointError | None:
 
 
 def largest_magnitude(values: Array) -> Array:
-    """Returns the largest absolute value of each row, shape (K,)."""
+    """Returns the largest absolute value of each row, for example over the joints of an arm.
+
+    Args:
+        values: Values, shape (K, n).
+
+    Returns:
+        The largest values, shape (K,). Zeros if a row has no entries.
+    """
     magnitudes = np.abs(values)
     largest: Array = magnitudes.max(axis=1, initial=0.0)
     return largest
@@ -136,6 +151,8 @@ def largest_magnitude(values: Array) -> Array:
 
 def largest_remaining_error(part: SiteLog) -> Array:
     """Returns for each record the largest error of any joint from there to the end.
+
+    The arm has settled where this value falls below a bound.
 
     Args:
         part: Log of the site.
@@ -152,9 +169,11 @@ def largest_remaining_error(part: SiteLog) -> Array:
 def settling_time_s(part: SiteLog) -> float | None:
     """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
 
+    From this time on, the arm stays close to its reference for the rest of the run.
+
     Returns:
         The time. 0 if no error ever exceeded the bound. None if the last record has an error
-        that exceeds it, or if there are no records.
+            that exceeds it, or if there are no records.
     """
     if not len(part):
         return None
@@ -169,7 +188,7 @@ def settling_time_s(part: SiteLog) -> float | None:
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
-    """Returns the time at which the last site has settled, in s.
+    """Returns the time at which the last site has settled, in s, for a run as a whole.
 
     Args:
         times_s: Settling time of each site, from `settling_time_s`. None for a site that has
@@ -186,6 +205,9 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
     """Returns how far operators displaced a site, compared with a run without operators.
+
+    Arms also move without operators, for example while they synchronise. The difference of both
+    runs is the motion due to the operators alone.
 
     Args:
         log: The log of the run.

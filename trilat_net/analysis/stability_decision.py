@@ -86,13 +86,18 @@ class LoopRoots(NamedTuple):
 
     @property
     def is_proof(self) -> bool:
-        """True if the roots prove that small motions about the final pose die away."""
+        """True if the roots prove that small motions about the final pose die away.
+
+        This needs exact roots: those of a loop with its ticks and its repeating delays.
+        """
         return self.exact and self.verdict == "stable"
 
     def describe_as_basis(self) -> str:
-        """Returns on what a decision rests if these roots of the control loop decide it.
+        """Returns the phrase that a decision shows after "rests on:" if these roots decide.
 
-        For example "exact roots, slowest -0.832 /s".
+        For example "exact roots, slowest -0.832 /s": the mode that decays most slowly has the
+        rate of -0.832 per second. If the roots refute stability, the fastest growing mode is
+        named instead. Without a root that is not zero, the phrase has no rate.
         """
         name = "roots by numerical derivatives" if self.is_numerical else "exact roots"
         if self.rate_per_s is None:
@@ -102,7 +107,10 @@ class LoopRoots(NamedTuple):
 
     @property
     def is_refutation(self) -> bool:
-        """True if the roots prove that small motions about the final pose grow."""
+        """True if the roots prove that small motions about the final pose grow.
+
+        This needs exact roots: those of a loop with its ticks and its repeating delays.
+        """
         return self.exact and self.verdict == "unstable"
 
 
@@ -123,7 +131,7 @@ class StabilityDecision(NamedTuple):
 
 
 class RunFindings(NamedTuple):
-    """Everything that is known about the stability of a run.
+    """Everything that is known about the stability of a run: the input of `decide_stability`.
 
     Attributes:
         end: How the motion ends.
@@ -145,12 +153,15 @@ class RunFindings(NamedTuple):
 
     @property
     def has_pushes(self) -> bool:
-        """True if twins of the run exist."""
+        """True if the run was repeated with small pushes (twins)."""
         return self.twins is not None and bool(self.twins.pushes)
 
     @property
     def all_proofs(self) -> list[str]:
-        """Phrases that name the proofs for this loop, exact roots last."""
+        """Phrases for everything that proves the control loop stable, exact roots last.
+
+        Empty if there is no proof. A decision joins the phrases to the text after "rests on:".
+        """
         proofs = list(self.proofs)
         if self.has_stable_roots:
             assert self.roots is not None
@@ -159,7 +170,10 @@ class RunFindings(NamedTuple):
 
     @property
     def has_stable_roots(self) -> bool:
-        """True if exact roots prove that small motions about the final pose die away."""
+        """True if exact roots were computed, and prove that small motions die away.
+
+        Roots that are not exact never count as a proof.
+        """
         return self.roots is not None and self.roots.is_proof
 
 

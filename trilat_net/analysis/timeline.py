@@ -91,12 +91,21 @@ class _AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """What was changed: a link "j->i", a site, or the dominance factors of a site."""
+        """What was changed: a link such as "m1->s", a site, or the shares of a site.
+
+        The shares are the dominance factors with which the site follows its peers, for example
+        "shares of s".
+        """
         return self.change.link or self.change.site or f"shares of {self.change.dominance}"
 
     @property
     def text(self) -> str:
-        """A phrase for the user: the order, or the setting that applies after the change."""
+        """A phrase for the user: what applies after the change.
+
+        For an order to a site, it is the order and its length, for example "hold, 500 ticks".
+        For a link, it describes the new delay, and for shares it lists the new shares with the
+        time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
+        """
         change = self.change
         if change.order:
             order = change.order.replace("_", " ")
@@ -124,12 +133,17 @@ class _ModeInterval(NamedTuple):
 
     @property
     def meaning(self) -> ModeMeaning:
-        """An explanation of what the arm does in this mode, such as holding its position."""
+        """An explanation of what the arm does in this mode, such as holding its position.
+
+        Texts for people use it, because names of modes such as "hold" explain little.
+        """
         return MODES[self.mode]
 
 
 class StatedModel(NamedTuple):
-    """A delay model that the scenario, or a change of it, prescribes for a link.
+    """A delay model that the scenario, or a change during the run, prescribes for a link.
+
+    Measured delays are compared with it.
 
     Attributes:
         from_s: Time from which the model applies, in s after the start of the session. It

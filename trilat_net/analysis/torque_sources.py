@@ -40,6 +40,8 @@ SCRIPT_TORQUE_TOLERANCE = 1e-8
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
     """Lists the virtual walls that the end effector of a site may touch, in scenario order.
 
+    A wall is a plane that pushes the end effector back with a spring and a damper.
+
     Args:
         spec: Description of the site.
     """
@@ -49,6 +51,8 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
     """Returns how deep an end effector is in a virtual wall, in m.
+
+    The force of the wall grows with the depth. Outside the wall there is no force.
 
     Args:
         wall: The wall.
@@ -288,14 +292,17 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """The operator's whole torque, shape (K, n), in N m."""
+        """The operator's whole torque, shape (K, n), in N m.
+
+        It is the sum of the continuous torque and the torque that is held over a tick.
+        """
         return self.operator_now + self.operator_held
 
     @property
     def environment(self) -> Array:
         """The torque of the environment, such as walls, on the arm, shape (K, n), in N m.
 
-        It is the sum of the continuous part and the part that is computed once per tick.
+        It is the sum of the continuous torque and the torque that is held over a tick.
         """
         return self.environment_now + self.environment_held
 
@@ -319,7 +326,7 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     end_effector = arm.place_end_effector(records.q, records.qd)
 
     def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
-        """Returns the sum of the torques of some operators or environments, in N m.
+        """Returns the sum of the torques that the models of operators or environments give.
 
         Args:
             sources: The operators or environments.

@@ -186,7 +186,7 @@ class ProcessStarter:
             )
 
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
-        """Requests the start of a command as a child process.
+        """Requests the start of a command of `trilat` as a child process.
 
         Args:
             name: Name of the process, which no other process of the session has.
@@ -258,10 +258,10 @@ class ProcessStarter:
                         os.kill(process.pid, signal.SIGINT)
 
     def close(self) -> None:
-        """Ends the starter, the process that starts all other processes of the session.
+        """Ends the starter, the child process that starts all other processes of the session.
 
         The method must be called after all other processes have ended, because nobody could
-        start or signal processes any more.
+        signal them any more.
         """
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)

@@ -615,7 +615,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """Results of the checks whether this machine is ready for a session.
+    """Result of `trilat doctor`: whether this machine is ready for a session.
 
     Attributes:
         findings: Result of each check, in the order of the checks.
@@ -624,28 +624,29 @@ class DoctorReport(Result):
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns a summary of the checks in one line.
-
-        The line contains the numbers of failed checks, of warnings and of passed checks.
-        """
+        """Returns the numbers of checks by result, for example "0 fail, 2 warn, 9 ok"."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all findings as plain values, which can be written as JSON.
+        """Returns all findings as plain values, with the keys of `trilat doctor --json`.
 
-        The keys are those that `trilat doctor --json` prints.
+        The only key is "findings". Its value has the rows of `to_rows`.
         """
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the findings as table rows, with the fields of `DoctorFinding` as columns."""
+        """Returns one table row per check, with the fields of `DoctorFinding` as columns."""
         return [finding._asdict() for finding in self.findings]
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the lines that `trilat doctor` prints, one per finding."""
+        """Returns the lines that `trilat doctor` prints, one per finding with its mark.
+
+        The module for texts is imported only here, because programs that read values need no
+        text.
+        """
         from ..presentation.summary_text import compose_doctor
 
         return compose_doctor(self)

@@ -55,10 +55,13 @@ class Device(Protocol):
         """Ends the force of the device, and closes the connection."""
 
     def read(self) -> DeviceState:
-        """Returns the newest state of the device.
+        """Returns the newest state of the device: the motion of its handle, and its buttons.
+
+        The method is called `rate_hz` times a second.
 
         Raises:
-            OSError: The device is silent or gone.
+            OSError: The device is silent or gone. The caller then leaves the `with` block of
+                the device, and connects again.
         """
 
     def render(self, force_n: Vector) -> None:

@@ -150,7 +150,7 @@ def _describe_hold(hand: HandInForce | None) -> str:
 
 
 def describe_angles(q: Sequence[float]) -> str:
-    """Formats the joint angles of an arm for the display.
+    """Formats the joint angles of an arm, so that many joints fit into a column of the table.
 
     Args:
         q: Joint angles in rad.
@@ -235,14 +235,14 @@ class SessionDisplay:
     def due(self) -> bool:
         """True if enough time has passed since the last update of the display.
 
-        Updates are limited in rate, because drawing a terminal takes time and no reader could
-        follow.
+        A table in a terminal is updated more often than lines in a file. Drawing takes time,
+        and no reader could follow faster changes.
         """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line that stays in the terminal, above the table of the sites.
+        """Prints a line, such as an event, that stays in the terminal above the table of sites.
 
         Args:
             text: The line.
@@ -253,6 +253,8 @@ class SessionDisplay:
         self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
     ) -> None:
         """Shows the present state of the session: a table of the sites, and alarms above it.
+
+        An alarm remains visible as long as it is present.
 
         Args:
             title: Title of the table.

@@ -92,7 +92,11 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
-        """Sends a message back, marked as a reply. Replies themselves are not sent back."""
+        """Sends a message of a benchmark back to its sender, marked as a reply.
+
+        Replies are not sent back, because they would circulate for ever. Messages without the
+        header of a benchmark are ignored.
+        """
         header = _parse_header(payload)
         if header is None:
             return
@@ -178,6 +182,8 @@ class NearEnd:
 
         def count_missing() -> int:
             """Stores the round trip times of messages that have come back meanwhile.
+
+            Replies to messages of earlier measurements are ignored.
 
             Returns:
                 The number of messages of this measurement that have not come back yet.
@@ -483,16 +489,17 @@ class NetworkBenchmark(Result):
 
     @property
     def good(self) -> bool:
-        """True if every transport that was measured is good enough for the scenario.
+        """True if every measured transport (TCP, TLS or QUIC) is good enough for the scenario.
 
-        A transport is the protocol that carries the messages: TCP, TLS or QUIC.
+        The exit code of `trilat ping --benchmark` depends on it.
         """
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, which can be written as JSON.
+        """Returns the result with the keys of `trilat ping --benchmark --json`.
 
-        The keys are those that `trilat ping --benchmark --json` prints.
+        "needs" states what the scenario requires of the network, "transports" judges each
+        transport, and "rows" has the measurements.
         """
         return {
             "scenario": self.scenario,
@@ -505,9 +512,10 @@ class NetworkBenchmark(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the measurements as rows of a table, with times in us.
+        """Returns one row per message size, message rate and transport, with times in us.
 
-        There is one row per message size, message rate and transport.
+        The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are None if
+        no message came back.
         """
         flat_rows = []
         for row in self.rows:
@@ -518,7 +526,11 @@ class NetworkBenchmark(Result):
         return flat_rows
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the table and the verdicts that `trilat ping --benchmark` prints."""
+        """Returns the table and the verdicts that `trilat ping --benchmark` prints.
+
+        The module for texts is imported only here, because programs that read values need no
+        text.
+        """
         from ..presentation.summary_text import compose_benchmark
 
         return compose_benchmark(self)

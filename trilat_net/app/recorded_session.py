@@ -15,7 +15,15 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
     """
 
     def read_scenario(text: str, source: str) -> RecordedScenario:
-        """Reads the text of a scenario that another process has sent."""
+        """Reads the text of a scenario that a process of the session has sent.
+
+        Args:
+            text: TOML text of the scenario.
+            source: Where the text comes from, for error messages.
+
+        Returns:
+            The facts that the recorder needs, and the function that makes views for viewers.
+        """
         scenario = parse_embedded(text, source)
         make_views = find_hook("offer the views of a log")(scenario, views_hz)
         return RecordedScenario(scenario, make_views)

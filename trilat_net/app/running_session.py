@@ -70,7 +70,7 @@ SOURCE = "the operator"
 
 
 def _never_stopped() -> bool:
-    """Returns False, as the function `stopped` of calls that are ended only by a time limit."""
+    """Returns False: the function `stopped` for calls that nothing but a time limit ends."""
     return False
 
 
@@ -343,7 +343,7 @@ class RunningSession:
         return _read_replies(self.send_order(sites, "reset"))
 
     def send_order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
-        """Sends an order such as "stop" to some sites.
+        """Sends an order such as "stop" to some sites, and waits for their replies.
 
         Args:
             sites: Names of the sites. Empty addresses all sites, or all that are present if the
@@ -532,7 +532,7 @@ class RunningSession:
         return reply.text
 
     def change(self, site: str, request: ChangeRequest) -> ChangeReply:
-        """Requests a change from the site that carries it out.
+        """Requests a change, for example of a link, from the site that carries it out.
 
         Args:
             site: Name of the site.

@@ -61,14 +61,18 @@ class PingReport(Result):
     links: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the rows of the members, for a table or a data frame.
+        """Returns one row per member of the session, for a table or a data frame.
 
-        The links are left out, because they have other columns.
+        The links between sites are left out, because they have other columns.
         """
         return self.members
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the tables of round trips that `trilat ping` prints."""
+        """Returns the tables of round trips that `trilat ping` prints.
+
+        The module for texts is imported only here, because programs that read values need no
+        text.
+        """
         from ..presentation.summary_text import compose_ping
 
         return compose_ping(self)
@@ -115,7 +119,8 @@ class SessionPing:
     def poll(self) -> None:
         """Receives the messages that have arrived, and sends pings and queries that are due.
 
-        The method does not wait.
+        The caller calls this method repeatedly until enough time has passed. The method does
+        not wait.
         """
         for info in self._members.poll():
             self.infos[info.member] = info
@@ -126,7 +131,10 @@ class SessionPing:
 
     @property
     def _boots(self) -> set[int]:
-        """Numbers that identify the members that have replied. Their pings are evaluated."""
+        """Random numbers (boots) of the processes that have replied as members of the session.
+
+        Only pings of these processes are evaluated.
+        """
         return {info.boot for info in self.infos.values()}
 
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
@@ -246,7 +254,10 @@ def ping_session(
     """
 
     def read_site_names(text: str) -> tuple[str, ...]:
-        """Returns the names of the sites in the text of a scenario."""
+        """Returns the names of the sites in the text of a scenario.
+
+        Returns an empty tuple if the scenario belongs to another version of the program.
+        """
         try:
             return parse_embedded(text, session).names
         except ScenarioError:
@@ -304,7 +315,11 @@ class TopicDelays(Result):
         return self.publishers
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the table of delays that `trilat ping --ros2` prints."""
+        """Returns the table of delays that `trilat ping --ros2` prints.
+
+        The module for texts is imported only here, because programs that read values need no
+        text.
+        """
         from ..presentation.summary_text import compose_topic_delays
 
         return compose_topic_delays(self)
@@ -317,7 +332,7 @@ def ping_topic(
     lasts_s: float,
     stopped: Callable[[], bool],
 ) -> TopicDelays:
-    """Measures the delays of the messages on a ROS 2 topic.
+    """Measures the delays of a ROS 2 topic, from the sending time that each message carries.
 
     Args:
         graph: Connection to the ROS 2 programs.

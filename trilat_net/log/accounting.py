@@ -76,7 +76,10 @@ class RangeSet:
         self._forget_lowest()
 
     def _forget_lowest(self) -> None:
-        """Removes the ranges with the lowest numbers if there are more than permitted."""
+        """Removes the ranges with the lowest numbers if there are more than permitted.
+
+        Thus the memory stays bounded, whatever a sender does (L6).
+        """
         del self._ranges[: -self._max_ranges]
 
     def remove(self, number: int, last: int | None = None) -> bool:
@@ -209,6 +212,8 @@ class Account:
     def refill(self, number: int) -> bool:
         """Counts a message that the sender sent again from its memory, as requested.
 
+        A recorder requests missing messages. A message that arrives in this way closes its gap.
+
         Args:
             number: Number of the message in its channel.
 
@@ -222,9 +227,11 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """States that the sender has published at least `published` messages, numbered from 0.
+        """States that the sender has published at least the messages 0 to `published` - 1.
 
-        Those that have not been received count as missing from now on.
+        Those that have not arrived count as missing from now on. Without such a statement,
+        messages missing at the end would remain unnoticed, because no later number reveals the
+        gap.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
@@ -286,6 +293,9 @@ class Account:
     def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
         """Finds the first missing messages that can still be requested from the sender.
 
+        Messages that no member has any more are left out, so that they are not requested again
+        and again.
+
         Args:
             number: Smallest number to consider.
 
@@ -296,29 +306,37 @@ class Account:
 
     @property
     def expected(self) -> int:
-        """Number of messages that are known to have been published."""
+        """Number of messages that are known to have been published.
+
+        Numbers that never had a message (`unpublished`) are not counted.
+        """
         return self.last + 1 - self.unpublished
 
     @property
     def missing(self) -> int:
-        """Number of messages that were published but not received."""
+        """Number of messages that were published, but not received, not even on request."""
         return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
         """Ranges of missing numbers in ascending order, as pairs [first, last].
 
-        There are at most `MAX_GAPS` pairs: those with the highest numbers.
+        For example [[10, 12]] if the messages 10, 11 and 12 are missing. There are at most
+        `MAX_GAPS` pairs: those with the highest numbers.
         """
         return [list(gap) for gap in self._gaps]
 
     @property
     def largest_gap(self) -> int:
-        """Number of missing messages in the largest gap. It is 0 if no message is missing."""
+        """Number of missing messages in the largest gap, 0 if no message is missing.
+
+        A long gap means an interruption, while the same number of single losses may be
+        harmless.
+        """
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def describe(self, *before: "Account") -> str:
-        """Describes the account of a channel in one line, in the form that a log stores.
+        """Describes the account of a channel in one line, as a log stores it for each channel.
 
         The line contains the numbers of expected, received and missing messages, and the first
         ranges of missing numbers.
@@ -353,6 +371,8 @@ class Account:
 
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Formats the first ranges of missing numbers for a message to the user.
+
+        For example ["10-12", "40-40"] if the numbers 10 to 12 and 40 are missing.
 
         Args:
             most: Largest number of ranges to return.
@@ -482,6 +502,8 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 def parse_counts(account: str) -> dict[str, int]:
     """Reads the numbers of received and missing messages from a line of `Account.describe`.
 
+    A finished log stores the counts as such lines, for people and for programs.
+
     Args:
         account: The line, as a log stores it for each topic.
 
@@ -513,7 +535,8 @@ class Coverage(NamedTuple):
     def share(self) -> float:
         """Smallest fraction of recorded or checked ticks of any site, from 0 to 1.
 
-        It is 0 if no site has ticks.
+        A run is known only as well as its worst site. The fraction is 0 if no site has ticks,
+        and a single site without ticks does not lower it.
         """
         if not any(self.expected.values()):
             return 0.0

@@ -53,7 +53,9 @@ _CHECKED_MESSAGES = 20
 
 
 class MessageOrigins(NamedTuple):
-    """Sessions and senders of a set of messages.
+    """Sessions and senders from which a set of messages comes.
+
+    A log has messages of a single session. Further sessions reveal parts of another file.
 
     Attributes:
         epochs_ns: Start times of the sessions, in Unix time, in ns.
@@ -169,6 +171,9 @@ class ContentCheck:
     def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
         """Notes a message that a checksum covers, so that the next one can be compared with it.
 
+        Messages of a channel have rising numbers and times, so that a trusted message bounds
+        those of its successor.
+
         Args:
             topic: Topic of the channel.
             sequence: Sequence number that the file stores with the message.
@@ -180,6 +185,8 @@ class ContentCheck:
 
     def owns_channel(self, topic: str) -> bool:
         """Finds out whether a topic is one of a member of this session.
+
+        A damaged file may contain parts of another log, whose topics name another session.
 
         Args:
             topic: Topic of a channel, such as "/trilat/paper/m1/state".

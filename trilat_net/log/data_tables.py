@@ -111,16 +111,16 @@ class Column(NamedTuple):
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a column of numbers as an array, shape (K,).
+        """Returns the values of a column of numbers, shape (K,), with NaN for missing values.
 
-        A row without a value contains NaN.
+        Exports to formats without missing values use it, such as NumPy files.
         """
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of consecutive rows as plain Python values.
+        """Returns the values of consecutive rows as plain Python values, for files such as CSV.
 
         Args:
             first: Index of the first row.
@@ -171,7 +171,7 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table in the form of a file name, such as "m1_link" or "events"."""
+        """Name of the table for file names, such as "m1_link", or "events" for all sites."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
 
@@ -417,7 +417,10 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that the site's control law sends to its peers."""
+    """Yields the columns of the numbers that the site's control law sends to its peers.
+
+    Their names begin with "ch_". For example "ch_force_m1_nm" is a torque that is sent to m1.
+    """
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
         stem = f"ch_{name}"

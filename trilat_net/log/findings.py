@@ -63,6 +63,8 @@ class Finding:
     def add(self, file: str, offset: int | None, text: str) -> None:
         """Adds a problem to the check, which has therefore not passed.
 
+        Only the first `_MAX_LISTED_PROBLEMS` problems are stored. All are counted.
+
         Args:
             file: Name of the file in which the problem was found.
             offset: Place of the problem in the file, in bytes. None if it concerns the whole
@@ -100,9 +102,10 @@ class Finding:
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns the result of the check as plain values for JSON.
+        """Returns the result of the check as one row of JSON: its name, text and outcome.
 
-        The single problems are left out. Their summary is in the text.
+        "judged" is False if the check could not be made. The single problems are left out,
+        because their summary is in the text.
         """
         return {
             "label": self.check,
@@ -113,9 +116,10 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """The results of several checks, by name of the check.
+    """The results of several checks, by name of the check, in the order of their first use.
 
-    When a name is read that does not exist yet, a result without problems is added for it.
+    A name that does not exist yet gets a result without problems when it is read. Thus a check
+    can add a problem by `findings["records"]` at any place.
     """
 
     def __missing__(self, check: str) -> Finding:
@@ -125,6 +129,8 @@ class Findings(dict[str, Finding]):
 
 class CheckReport(Result):
     """Base class of the results of commands that check a log in several respects.
+
+    It derives from the findings whether the log passed, and the exit code of the command.
 
     Attributes:
         findings: The result of each check.
@@ -151,5 +157,5 @@ class CheckReport(Result):
         return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the results of all checks as plain values for JSON, one row per check."""
+        """Returns one row per check, with the keys "label", "text", "passed" and "judged"."""
         return [finding.to_row() for finding in self.findings]

@@ -81,7 +81,7 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Frees the reserved disk space, so that other files can use it.
+        """Frees the reserved disk space, so that the end of the log fits on a full disk.
 
         Later calls of `grow` reserve nothing.
         """
@@ -167,7 +167,7 @@ class _FileSync:
     def wait(self) -> None:
         """Waits until the thread that syncs the file has ended.
 
-        The file must not be closed before.
+        The file must not be closed before, as the thread uses its descriptor.
         """
         if self._thread is not None:
             self._thread.join()
@@ -270,6 +270,8 @@ class LogFile:
     def write(self, data: bytes, /) -> int:
         """Stores bytes in memory. The next `flush` writes them to the file.
 
+        A slow disk therefore cannot stop the caller while messages arrive.
+
         Args:
             data: The bytes.
 
@@ -345,7 +347,10 @@ class LogFile:
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes the data of an incomplete flush, so that the file ends at the one before."""
+        """Removes the data of an incomplete flush, so that the file ends at the previous flush.
+
+        A log that ends with half a chunk could only be read after a recovery.
+        """
         self._broken = True
         self._pending = bytearray()
         self._written = 0
@@ -354,7 +359,11 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True if the file is complete: it ends with the end mark of the MCAP format."""
+        """True if the file is complete: it ends with the end mark of the MCAP format.
+
+        Only such a file gets its final name. Another one keeps the suffix ".active", and can be
+        recovered.
+        """
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
@@ -387,7 +396,10 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes the file and removes it, because the log is not wanted."""
+        """Closes the file and removes it, because the log is not wanted.
+
+        An error while closing is ignored, since no data need to be saved.
+        """
         with suppress(OSError):
             self.close()
         self.working.unlink(missing_ok=True)

@@ -114,7 +114,7 @@ class ChannelFilter:
     exclude: tuple[str, ...] = ()
 
     def accepts(self, key: str) -> bool:
-        """Finds out whether a channel is recorded.
+        """Finds out whether a channel is recorded, by the patterns that the user gave.
 
         Args:
             key: Key of the channel in the network, such as "trilat/paper/m1/state".

@@ -149,8 +149,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def headline(self) -> str:
         """Summarises the session in one line for the user.
 
-        Returns:
-            A text with how the session ran, its sites, its length and its number of records.
+        The line says how the session ran, its sites, its length and its number of records. It
+        ends with "not finished" if the end of the log is missing.
         """
         try:
             summary = self._describe_records()
@@ -176,9 +176,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return text
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns a summary of the session as plain values, for JSON.
+        """Returns a summary of the session, with the keys of `trilat sim --json`.
 
-        The keys are those of the output of `trilat sim --json`.
+        The entry "sites" has the numbers of each site by its name. The records themselves are
+        not included.
         """
         return {
             "files": list(self.sources),
@@ -212,7 +213,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return rows
 
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
-        """Returns a table of the log as a pandas data frame.
+        """Returns a table of the log as a pandas data frame, for example the records of a site.
 
         Args:
             name: Name of the table, see `table`. If it is empty, the frame has a row per site.
@@ -341,7 +342,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def diverged_s(self) -> float | None:
         """Time at which the first arm exceeded a safety limit, which ended the run, in s.
 
-        It is None if all arms stayed within their limits.
+        None if all arms stayed within their limits.
         """
         times_s = [part.diverged_s for part in self.values()]
         known_times_s = [time_s for time_s in times_s if time_s is not None]
@@ -374,7 +375,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def failed_hands(self) -> list[str]:
-        """Sentences that say which programs failed while they moved an arm, when, and why."""
+        """Sentences on the programs that failed while they moved an arm: which, when, and why.
+
+        Empty if none failed.
+        """
         return [
             event.text
             for event in self.events
@@ -427,10 +431,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of this file, if the recorder split the log into several files.
+        """Number of this file, from 1, if the recorder split the log into several files.
 
-        The first part has the number 1. The number is 0 for a log in a single file, and for
-        several files that were opened together.
+        It is 0 for a log in a single file, for several files that were opened together, and for
+        a file without a valid number.
         """
         if len(self.sources) > 1:
             return 0
@@ -479,6 +483,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def account(self, site: str) -> str:
         """Returns how many records of a site were received and how many are missing.
 
+        The recorder counted them. They need not agree with the file if the file is damaged.
+
         Args:
             site: Name of the site.
 
@@ -508,7 +514,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of ticks that each site states in its "end" event, at most the scenario's."""
+        """Number of ticks that each site states in its "end" event, by site.
+
+        A number above that of the scenario is reduced to it. Sites without such an event are
+        missing.
+        """
         ticks = {}
         for event in self.events:
             if event.kind == "end" and event.member in self.scenario.sites:
@@ -627,7 +637,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return max(ticks, recorded) - self.absent_ticks(site)
 
     def _is_gone(self, site: str) -> bool:
-        """Returns True if the latest news about a site is that it was lost or left."""
+        """Returns True if the latest news about a site is that it was lost or left.
+
+        The other sites publish this news as events.
+        """
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
         if not events:
@@ -741,11 +754,13 @@ class Log(Result, Mapping[str, SiteLog]):
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
         """Lists the changes that a site applied, decoded so that the run can be executed again.
 
+        `changes` returns the same changes as JSON texts.
+
         Args:
             site: Name of the site.
 
         Returns:
-            For each tick with changes, the changes in the form that `Site.step` receives.
+            For each tick with changes, the changes as `Site.step` receives them.
 
         Raises:
             LogError: A text is not a valid change of the scenario.
@@ -781,7 +796,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
-        """Decodes the statistics that a site published about its links.
+        """Decodes the statistics that a site published about its links, such as losses.
 
         Args:
             site: Name of the site.
@@ -792,7 +807,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Decodes the statistics that a site published about its links to other sites.
+        """Decodes the statistics that a site published about its links, with their times.
 
         Args:
             site: Name of the site, the process that runs one arm.
@@ -830,7 +845,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages(ordered_events, log_ns[order], publish_ns[order])
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Decodes the statistics that the recorder published about itself.
+        """Decodes the statistics that the recorder published about itself while it recorded.
+
+        They show, for example, how many messages of each channel were missing.
 
         Returns:
             The messages in the order of the file. Empty if the log contains none.
@@ -867,7 +884,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def tables(self) -> Iterator[Table]:
         """Yields every table of the log, for example to export all of them.
 
-        The tables of each site come first, then that of the events. Only one of them is in
+        The tables of each site come first, then the table of the events. Only one of them is in
         memory at a time.
         """
         for site in self.sites:
@@ -876,7 +893,9 @@ class Log(Result, Mapping[str, SiteLog]):
         yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
-        """Returns a table of the log as a polars data frame. `to_frame` returns a pandas frame.
+        """Returns a table of the log as a polars data frame.
+
+        `to_frame` returns a pandas data frame.
 
         Args:
             name: Name of a site, or "events".

@@ -171,6 +171,9 @@ def check_signatures(
 ) -> Finding:
     """Checks that logs are exactly those that the owner of a public key has signed.
 
+    A digest shows only accidental changes, as anybody can compute it again. A signature shows
+    who vouches for the log.
+
     Args:
         paths: The logs. The signature of a log is in a file beside it.
         key_file: File of the public key of a signer whom the user trusts.

@@ -60,7 +60,11 @@ class _LogViews(Protocol):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes."""
+        """Upper bound for the size of the messages that are not written yet, in bytes.
+
+        A writer adds this size when it decides whether the next message still fits into the
+        file.
+        """
 
     def open_channels(self, file: McapWriter) -> _ViewChannels:
         """Returns the channels for viewers of a file, which are registered when needed.
@@ -70,7 +74,7 @@ class _LogViews(Protocol):
         """
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages, at the end of the log.
+        """Writes the remaining messages for viewers, at the end of the log.
 
         Args:
             log_ns: Arrival time of the last message of the session, in Unix time, in ns.
@@ -203,12 +207,15 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True if no message can be added: the log is finished, or the disk refused data."""
+        """True if no message can be added: the log is finished, or the disk refused data.
+
+        Messages that arrive later are then missing in this file.
+        """
         return bool(self._end_reason)
 
     @property
     def messages(self) -> int:
-        """Number of messages that were added to the file."""
+        """Number of messages that were added to the file, even if not yet on the disk."""
         return self._file.messages
 
     @property
@@ -220,8 +227,8 @@ class LogWriter:
     def most_bytes(self) -> int:
         """Largest size of the file if it were finished now, in bytes.
 
-        The numbers of received and missing messages, which `finish` also writes, are not
-        included.
+        It shows whether a further message still fits into a part of limited size. The numbers
+        of received and missing messages, which `finish` also writes, are not included.
         """
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
@@ -235,7 +242,7 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message, unless the filter excludes its channel.
+        """Adds one message of the session to the log, unless the filter excludes its channel.
 
         Args:
             key: Key of the channel.
@@ -282,9 +289,7 @@ class LogWriter:
         self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
 
     def flush(self) -> None:
-        """Passes all messages so far to the operating system.
-
-        They are not lost if the process crashes afterwards.
+        """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
         Raises:
             LogRefused: The disk refused the data.
@@ -538,7 +543,10 @@ class LogParts:
 
     @property
     def path(self) -> Path:
-        """Final name of the file that is being written."""
+        """Final name of the file that is being written, such as run-002.mcap for part 2.
+
+        While it is written, the file has another name, which ends with ".active".
+        """
         return self._file.path
 
     @property
@@ -583,13 +591,15 @@ class LogParts:
     def flush(self) -> None:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
+        A loss of power still can, because the operating system writes to the disk later.
+
         Raises:
             LogRefused: The disk refused the data.
         """
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last part, so that the log is finished.
+        """Completes the last part, so that the log is finished and gets its final name.
 
         Args:
             accounts: Numbers of received and missing messages as a string, by topic, and other

@@ -348,7 +348,7 @@ class McapReader:
         yield from self._walk()
 
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
-        """Yields what the scanner finds, and keeps the position and the progress."""
+        """Yields what the scanner finds, and updates the position and the reported progress."""
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
                 yield item
@@ -392,7 +392,10 @@ class McapReader:
 
     @property
     def _gave_up(self) -> bool:
-        """True if there were so many damaged parts that no more records are read."""
+        """True if the file has so many damaged parts that the reader has stopped.
+
+        The limit bounds the time and the memory that a file of random bytes can cost.
+        """
         return self._is_scanned and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _unpack(self, record: mcap_records.ScannedRecord) -> bytes:
@@ -825,7 +828,7 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Adds the next message of the topic.
+        """Adds the next message of the topic, in the order of the file.
 
         Args:
             payload: The message, encoded as published.
@@ -949,6 +952,8 @@ def _is_log_topic(topic: str) -> bool:
 
 def check_log(stream: BinaryIO, name: str) -> None:
     """Reads a log once without storing its messages, to find out whether it can be opened.
+
+    A log of any length can be checked with little memory.
 
     Args:
         stream: The file, opened for reading.

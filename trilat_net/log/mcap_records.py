@@ -76,7 +76,8 @@ _COMPRESSION_NAME = re.compile(
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
     """Error that a part of a file makes no sense. Its text states the reason.
 
-    It is used only within the package `log`.
+    It is used only within the package `log`: a scan catches it and continues at the next
+    readable part, and a check reports it.
     """
 
 
@@ -135,6 +136,9 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
 
 def unpack_chunk(content: bytes) -> bytes:
     """Unpacks the compressed records of a chunk, and checks them against its head.
+
+    The head may lie. Therefore no more is unpacked than its stated size, within reasonable
+    limits.
 
     Args:
         content: Content of the chunk: its head and the compressed records.
@@ -202,7 +206,7 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray, offset: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Finds the records in an unpacked chunk, one after another.
+    """Finds the records in an unpacked chunk, one after another, without decoding them.
 
     Args:
         data: The unpacked chunk.
@@ -249,12 +253,14 @@ class RecordFrame(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Offset of the first byte after the record."""
+        """Offset of the first byte after the record, at which the next record begins."""
         return self.offset + self.size
 
 
 class Damage(NamedTuple):
     """A part of a file that cannot be read, and the reason.
+
+    A scan continues after the part. Checks report it, and a recovery counts its bytes as lost.
 
     Attributes:
         offset: Offset of the part's first byte in the file.
@@ -292,13 +298,18 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record, without the fields for its kind and its length."""
+        """Content of the record, without the fields for its kind and its length.
+
+        It is read from the file at first use, so that a scan of a large file is fast.
+        """
         if self._content is None:
             self._content = self._scanner.content(self.frame)
         return self._content
 
     def head(self) -> "ChunkHead":
-        """Returns the head of a chunk, see `RecordScanner.head`.
+        """Returns the head of a chunk, without unpacking its messages.
+
+        The head states the times of the messages, and how they are compressed.
 
         Raises:
             UnreadableRecord: The head is incomplete, or contains impossible values.
@@ -355,7 +366,7 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads bytes of the file.
+        """Reads bytes of the file, but never beyond its end.
 
         Args:
             offset: Offset of the first byte in the file.
@@ -368,7 +379,10 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every record that `scan` finds."""
+        """Yields the kind and the position of every record that `scan` finds.
+
+        Unreadable parts of the file are left out.
+        """
         for item in self.scan():
             if isinstance(item, ScannedRecord):
                 yield item.frame
@@ -535,7 +549,7 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 checksum of a part of the file.
+        """Computes the CRC-32 checksum of a part of the file, to compare it with a stored one.
 
         Args:
             begin: Offset of the first byte of the part.
@@ -578,7 +592,7 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Checks the content of an attachment by the checksum at its end.
+    """Checks the content of an attachment, such as the scenario, by the checksum at its end.
 
     Args:
         attachment: Content of the attachment's record.
@@ -592,6 +606,8 @@ def has_right_crc(attachment: bytes) -> bool:
 
 def parse_record(opcode: int, content: bytes) -> Any:
     """Decodes the content of a record with the `mcap` package.
+
+    The package raises various errors for damaged content. Here they become a single kind.
 
     Args:
         opcode: Number of the kind of record, which must be in `KINDS`.

@@ -52,10 +52,10 @@ the end of the data, the footer and the end mark.
 
 
 class Sink(Protocol):
-    """A file, or a buffer that keeps the bytes until `flush` is called.
+    """Where the writer puts the bytes of the file: a file, or a buffer that waits for `flush`.
 
     If the sink has a method `reserve(size)`, the writer calls it with the number of bytes that
-    the end of the file will need.
+    the end of the file will need. Disk space for them can then be reserved.
     """
 
     def write(self, data: bytes, /) -> int:
@@ -69,7 +69,7 @@ class Sink(Protocol):
         """
 
     def flush(self) -> None:
-        """Writes all bytes that are stored in the buffer."""
+        """Passes all bytes that are stored in the buffer on to the file."""
 
 
 def _pack_text(text: str) -> bytes:
@@ -207,7 +207,7 @@ class McapWriter:
         return (last_ns - first_ns) * 1e-9
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Writes a schema to the file, which describes the fields of messages.
+        """Writes a schema to the file, so that other programs can decode the messages.
 
         Args:
             name: Name of the schema.
@@ -258,6 +258,8 @@ class McapWriter:
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
         """Adds a message to the open chunk, and writes the chunk if it is large enough.
+
+        Messages of a chunk are compressed together, which makes the file much smaller.
 
         Args:
             channel_id: Number of the channel, from `register_channel`.
@@ -318,7 +320,11 @@ class McapWriter:
         self._add_to_summary(Opcode.ATTACHMENT_INDEX, index)
 
     def flush(self) -> None:
-        """Closes the open chunk, if it contains messages, and flushes the stream."""
+        """Ends the open chunk, if it contains messages, and flushes the stream.
+
+        All messages so far can then be read from the file, even if the program ends now.
+        Frequent calls make small chunks, which are compressed less well.
+        """
         if self._open_chunk:
             self._close_chunk()
         if self._reserve is not None:

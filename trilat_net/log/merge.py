@@ -116,7 +116,7 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:
-    """Returns the arrival time of a part's first message, and its name, as a sorting key."""
+    """Returns a sorting key for parts: the first message's arrival time, and the name."""
     first_times = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
     return min(first_times, default=1 << 63), part.source
 
@@ -172,6 +172,8 @@ def _recorder_boot(part: LogContents) -> int:
 
 def identify_session(part: LogContents) -> dict[str, str]:
     """Collects the facts that identify a session, on which all parts of its log agree.
+
+    Files can be read as one log only if these facts are equal.
 
     Args:
         part: Contents of one part.

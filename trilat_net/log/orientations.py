@@ -59,6 +59,9 @@ def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
 def compute_quaternions(turns: Array) -> Array:
     """Computes the unit quaternions of rotation vectors as a time series without jumps.
 
+    A quaternion and its negative are the same rotation. The sign is chosen such that
+    neighbouring quaternions are close to each other, as curves and interpolation require.
+
     Args:
         turns: Rotation vectors in the order of time, shape (K, 3), in rad.
 

@@ -109,13 +109,17 @@ class Recovery(Result):
 
     @property
     def lossless(self) -> bool:
-        """True if the new file contains everything that the source file contains."""
+        """True if the new file contains everything that the source file contains.
+
+        False if some bytes could not be read or assigned. `lost` then describes them.
+        """
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of the recovery as plain values for JSON.
+        """Returns the result of the recovery, with the keys of `trilat log recover --json`.
 
-        The keys are those of the output of `trilat log recover --json`.
+        The entries say what was saved ("messages", "coverage"), and what was lost
+        ("lost_bytes", "missing").
         """
         return {
             "file": self.path.as_posix(),
@@ -919,7 +923,11 @@ class _FileCopy:
         return ""
 
     def _report_final_losses(self) -> None:
-        """Adds the losses that are known only after all records were read."""
+        """Adds the losses that are known only after all records were read.
+
+        For example, messages of a channel that no record defines, because a definition may
+        follow its messages.
+        """
         result = self._result
         for number, count in self._unnamed.items():
             result.add_loss(

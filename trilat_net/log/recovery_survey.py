@@ -290,7 +290,11 @@ class RecoverySurvey:
         topic_prefix = f"/{topics.ROOT}/{session.get('session', '')}/".encode()
 
         def is_genuine(definition: Definition) -> bool:
-            """Returns True if a definition may belong to the session of the messages."""
+            """Returns True if a definition may belong to the session of the messages.
+
+            Definitions under a checksum do. Others are foreign if they name another session,
+            and either lie in a part of the disk with foreign data or the session was renamed.
+            """
             offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition
                 return True

@@ -53,6 +53,8 @@ class DigestState(StrEnum):
 class Integrity(NamedTuple):
     """States whether a log agrees with its digests, checksums that reveal changes.
 
+    Every certificate and check mentions the result, because a changed log proves nothing.
+
     Attributes:
         state: The result of the comparison.
         text: A sentence for the user that explains it.
@@ -63,9 +65,10 @@ class Integrity(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """False only if something in the file was changed or removed.
+        """False only if something in the file was changed or removed after it was recorded.
 
-        A file without digests, or a file that was not finished, cannot be compared. It passes.
+        A file without digests, or a file that was not finished, cannot be compared. It passes,
+        because nothing speaks against it.
         """
         return self.state is not DigestState.CHANGED
 
@@ -87,7 +90,7 @@ class RunningDigest:
         self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Adds messages to the checksum of the messages, in the order of the file.
+        """Adds messages to the digest of the messages, in the order of the file.
 
         Args:
             data: The messages with their headers, as in an unpacked chunk of the MCAP file.

@@ -190,7 +190,11 @@ class SessionAccounts:
             self._apply_last(event)
 
     def _apply_join(self, event: Event) -> None:
-        """Handles the event of a site that joins the running session at a stated tick."""
+        """Handles the event of a site that joins the running session at a stated tick.
+
+        The site publishes nothing for the ticks before, so that these must not count as
+        missing.
+        """
         site = event.member
         published_ticks = self._end_ticks.pop(site, 0)
         rate_hz = self._rates_hz[site]
@@ -219,7 +223,11 @@ class SessionAccounts:
                 self.mark_skipped_ticks(event.member, next_tick, next_tick - first)
 
     def _apply_last(self, event: Event) -> None:
-        """Handles the event that states how many ticks of a peer's earlier start arrived."""
+        """Handles the event that states how many ticks of a peer's earlier start arrived.
+
+        It shows how many messages the peer published at least before it was killed, which
+        decides whether missing ones were lost or never sent.
+        """
         site = event.about
         for channel, gap in self._find_start_gaps(site, event.boots.get(site, 0)):
             base = self._bases.get(self._topic(site, channel), 0)
@@ -356,6 +364,9 @@ class SessionAccounts:
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
         """Lists the ranges of missing numbers of a topic, over all starts of its sender.
 
+        Events are numbered from 0 again at each start of their sender. Each start then has an
+        account of its own, and all of them are considered.
+
         Args:
             topic: Topic of the channel.
 
@@ -389,10 +400,11 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Describes the missing records for the user.
+        """Describes the missing records for the user, one line for each site that lacks some.
 
         Yields:
-            A line for every site that lacks records, with the first ranges of missing ticks.
+            A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks.
+                Sites without missing records have no line.
         """
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)

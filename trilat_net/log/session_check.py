@@ -67,7 +67,7 @@ _ACCOUNTS_SINCE = 3
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """Result of checking the files of one log, as `check_file` returns it.
+    """Result of checking the files of one log, as `trilat log check` prints it.
 
     Attributes:
         files: Names of the files.
@@ -81,9 +81,10 @@ class LogCheckResult(CheckReport):
     ours: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of all checks as plain values for JSON.
+        """Returns the result of all checks, with the keys of `trilat log check --json`.
 
-        The keys are those of the output of `trilat log check --json`.
+        The entry "kind" is "trilat" for a log of this program and "mcap" for another MCAP file,
+        whose bytes alone were checked.
         """
         kind = "trilat" if self.ours else "mcap"
         return {
@@ -203,7 +204,7 @@ class _ChannelCheck:
 
     @property
     def name(self) -> str:
-        """Short name of the channel for texts, such as "m1/state"."""
+        """Short name of the channel for texts, such as "m1/state": the member and the kind."""
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:

@@ -16,11 +16,15 @@ class _SiteRate(Protocol):
 
     @property
     def rate_hz(self) -> int:
-        """Rate of the site's control loop, in Hz."""
+        """Rate of the site's control loop, in Hz, which relates ticks to times."""
 
 
 class SessionScenario(Protocol):
-    """A resolved scenario, with the facts from which the messages of its session follow."""
+    """The facts about a scenario from which the messages of its session follow.
+
+    `scenario.Scenario` has these attributes. The recorder depends only on this protocol, so
+    that it need not import the program that reads scenarios.
+    """
 
     @property
     def name(self) -> str:
@@ -36,7 +40,7 @@ class SessionScenario(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, in the order of the scenario file."""
+        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file."""
 
     @property
     def sites(self) -> Mapping[str, _SiteRate]:
@@ -44,7 +48,7 @@ class SessionScenario(Protocol):
 
     @property
     def text(self) -> str:
-        """The scenario as a TOML text in its canonical form."""
+        """The scenario as a TOML text in its canonical form, which the log contains."""
 
     @property
     def sha256(self) -> str:
@@ -52,17 +56,20 @@ class SessionScenario(Protocol):
 
     @property
     def sites_may_return(self) -> bool:
-        """True if sites may leave the session and return while it runs."""
+        """True if sites may leave the session and return while it runs.
+
+        The recorder and the checks of a log then accept that a site begins again.
+        """
 
     def ticks(self, site: str) -> int:
-        """Returns how many ticks a site executes in the whole run.
+        """Returns how many ticks a site executes in the whole run, from duration and tick rate.
 
         Args:
             site: Name of the site.
         """
 
     def layout(self, site: str) -> Layout:
-        """Returns the lengths of the vectors in the records of a site.
+        """Returns the lengths of the vectors in a site's records, such as its number of joints.
 
         Args:
             site: Name of the site.

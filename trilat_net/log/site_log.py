@@ -161,7 +161,11 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=blocks)
         def get_block(number: int) -> list[State]:
-            """Decodes and returns consecutive records: the block `number`, counted from 0."""
+            """Returns a block of consecutive records, decoded unless it is in memory.
+
+            Args:
+                number: Number of the block, counted from 0.
+            """
             first = number * size
             return decode_block(payloads[first : first + size])
 
@@ -264,7 +268,7 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class TimedMessages(NamedTuple, Generic[M]):
-    """Messages of a log with their arrival and sending times.
+    """Messages of a log with the times at which they were sent and at which they arrived.
 
     Attributes:
         messages: The K messages.
@@ -460,7 +464,7 @@ class SiteLog:
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
-        """Returns an integer field of all records.
+        """Returns an integer field of all records as an array, for example "busy_us".
 
         Args:
             field: Name of the field in a record, see `State`.
@@ -497,7 +501,7 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record, without decoding the others.
+        """Decodes a single record, without decoding the others, which is fast for a long log.
 
         Args:
             n: Index of the record in the order of ticks. -1 is the last record.
@@ -526,27 +530,32 @@ class SiteLog:
     def states(self) -> Sequence[State]:
         """The whole records in the order of their ticks, decoded and checked.
 
-        If there are many, a record is decoded only when it is accessed.
+        If there are many, a record is decoded only when it is accessed. To compute with a
+        single quantity, the arrays such as `q` are much faster.
         """
         return decode_records(self.payloads, self.decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """The records by tick. If several records have the same tick, the last one counts."""
+        """The records by tick, to compare two logs whose records may have gaps.
+
+        If several records have the same tick, the last one counts.
+        """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
     @property
     def last_tick(self) -> int:
-        """Tick of the last record. It is -1 if there are no records."""
+        """Tick of the last record, counted from the start of the run. -1 without records."""
         return int(self.tick[-1]) if len(self) else -1
 
     @property
     def diverged_s(self) -> float | None:
         """Time at which the arm exceeded a safety limit, which ended the run, in s.
 
-        It is None if the arm stayed within its limits.
+        It is the time of the last record if its mode is "diverged". None if the arm stayed
+        within its limits, or if there are no records.
         """
         if not len(self):
             return None
@@ -555,7 +564,11 @@ class SiteLog:
 
     @property
     def missing(self) -> int:
-        """Number of ticks before the last record that have no record."""
+        """Number of ticks before the last record that have no record.
+
+        The network or a full queue lost these records, or the site skipped the ticks. Records
+        that are missing at the end cannot be counted here.
+        """
         if not len(self):
             return 0
         # There are `last_tick` ticks before the last record. The ticks of the log, without
@@ -565,7 +578,10 @@ class SiteLog:
 
     @property
     def skipped(self) -> int:
-        """Number of ticks that the site skipped because it was late, as its records state."""
+        """Number of ticks that the site skipped because it was late, as its records state.
+
+        Only a site with an external arm skips ticks: a real arm cannot catch up.
+        """
         return sum(count_skipped_ticks(texts) for texts in self._changes.values())
 
     mode = _RecordField(
@@ -630,7 +646,10 @@ class SiteLog:
 
     @cached_property
     def t_s(self) -> Array:
-        """Nominal time since the epoch, the common start of the session, shape (K,), in s."""
+        """Nominal time since the epoch, the common start of the session, shape (K,), in s.
+
+        It is the ideal time of each tick, not the time at which the tick was computed.
+        """
         return freeze(self.t_ns / NS_PER_S)
 
     @cached_property
@@ -708,7 +727,7 @@ class SiteLog:
         """Computing time of each tick except the last one, shape (K - 1,), in us.
 
         A record contains the computing time of the tick before, because its own is not known
-        yet when the record is published.
+        yet when the record is published. The values are moved by one row accordingly.
         """
         return self.numbers("busy_us")[1:]
 

@@ -11,7 +11,7 @@ FULL_RATE_HZ = math.inf
 
 
 def parse_viz_rate(text: str) -> float:
-    """Parses the option `--views`, the rate of the messages for viewers.
+    """Parses the option `--views`, the rate of the messages for viewers such as Foxglove.
 
     Args:
         text: A number from 1 to 1e6, "off" or "full".

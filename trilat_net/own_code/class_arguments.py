@@ -24,7 +24,10 @@ _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
 def make_own_instance(
     kind: Any, code: str, context: Any, settings: dict[str, Any], path: str
 ) -> Any:
-    """Returns an instance of a user's class, after a check of its arguments.
+    """Creates an object of a user's class, after a check of its arguments.
+
+    An argument that is wrong is reported by its path in the scenario, like any other key, and
+    not as an exception within the class.
 
     Args:
         kind: The class.
@@ -42,7 +45,7 @@ def make_own_instance(
 
 
 def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
-    """Refuses arguments that a user's class does not accept.
+    """Refuses arguments that a user's class does not accept, before an object is created.
 
     Args:
         kind: The class, whose first argument is for the facts about the site.

@@ -83,19 +83,23 @@ class NamedCode(Protocol):
 
     @property
     def code(self) -> str:
-        """Module and name of the class, for example "package.module:Law"."""
+        """Module and name of the user's class, for example "package.module:Law"."""
 
     @property
     def source_sha256(self) -> str:
-        """SHA-256 hash of the file of the module. It shows whether the file has changed."""
+        """SHA-256 hash of the file of the module, which shows whether the file has changed."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments with which an object of the user's class is created, by name."""
+        """Arguments by name with which an object of the user's class is created."""
 
 
 class SiteWithCode(Protocol):
-    """Interface of a site of a scenario whose parts may be classes of users."""
+    """Interface of a site of a scenario whose parts may be classes of users.
+
+    These parts are its control law, its operators and its plant. The checks of permissions look
+    for users' classes here, without importing the types of scenarios.
+    """
 
     @property
     def control(self) -> Any:
@@ -158,7 +162,7 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission to run the code of a file.
+    """Permission of a person to run the code of one file, which a scenario names.
 
     Attributes:
         file: Path of the file. If None, it is the file that Python's import finds for the
@@ -352,6 +356,8 @@ class _CodeSource(NamedTuple):
 
 def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
     """Reads the file that defines a class, without running any code of it.
+
+    Its hash shows whether a permission applies to it.
 
     Args:
         code: Module and class, for example "package.module:Law".

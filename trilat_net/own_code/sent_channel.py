@@ -124,6 +124,8 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
 def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
     """Returns the vectors that a law's class declares in a file, without running the file.
 
+    The scenario must know these vectors before anybody has permitted the code.
+
     Args:
         source: Content of the file.
         file: The file, for errors.

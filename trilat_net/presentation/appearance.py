@@ -60,7 +60,11 @@ class FigureSize(NamedTuple):
 
     @property
     def narrow(self) -> bool:
-        """True if the figure is too narrow for two panels with long texts beside each other."""
+        """True if the figure is narrower than 5 in: too narrow for two panels side by side.
+
+        Figures then put their panels, parts with axes of their own, below each other, or show
+        fewer labels.
+        """
         return self.width_in < 5.0
 
 
@@ -69,7 +73,7 @@ REPORT_SIZE = FigureSize(width_in=PAGE_IN, tick_pt=7.0, small_pt=6.0, dpi=200)
 
 
 def make_print_size(width_in: float) -> FigureSize:
-    """Returns the size of a figure for a paper, with type of 8 pt.
+    """Returns the size of a figure that fits a column or the page of a paper, with 8 pt type.
 
     Args:
         width_in: Width in inches: 3.5 for one column, or 7 for two columns.

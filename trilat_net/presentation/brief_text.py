@@ -59,6 +59,8 @@ _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
 def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
     """Yields the judgement of a certificate and its most important reasons.
 
+    `trilat certify` prints these lines, unless --all asks for all of them.
+
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """
@@ -76,7 +78,10 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
 
 
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
-    """Returns the judgement and the most important other lines, in their order."""
+    """Returns the judgement and the most important other lines, in their original order.
+
+    Lines that speak against stability are more important than lines that confirm it.
+    """
     ranks = [_MARK_RANKS[line.mark] for line in lines]
     ranks[0] = -1
     by_importance = sorted(range(len(lines)), key=lambda index: (ranks[index], index))
@@ -86,6 +91,9 @@ def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
 
 def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields a table with the ten most important numbers of a run, each with its subject.
+
+    The subject is, for example, the site with the largest value, or "every site" if all have
+    the same.
 
     Args:
         metrics: All numbers of the run.
@@ -126,7 +134,11 @@ def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
 
 
 def _name_subject(quantity: Quantity, values: dict[str, Metric]) -> str:
-    """Returns the subject with the largest number of a quantity, or what the number sums."""
+    """Returns whose number the table of key numbers shows for a quantity.
+
+    This is the subject with the largest number, such as "m1". For a sum it is "all sites
+    together", and for equal numbers "every site".
+    """
     numbers = {subject: metric.value for subject, metric in values.items()}
     known = {subject: value for subject, value in numbers.items() if value is not None}
     if quantity.of == "run":

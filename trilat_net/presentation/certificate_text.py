@@ -135,7 +135,11 @@ class CertificateLine(NamedTuple):
 
     @property
     def print_form(self) -> MarkedText:
-        """The sentence behind its mark, without a first word that repeats the mark."""
+        """The sentence behind its coloured mark, as the terminal and the page show it.
+
+        The mark says "ok", for example. If the sentence begins with the same word and a colon,
+        it is left out, so that it does not appear twice.
+        """
         return MarkedText(MARKS[self.mark], self.text.removeprefix(f"{self.mark}: "))
 
 
@@ -258,7 +262,7 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_theorem(certificate: Certificate) -> list[str]:
-    """Returns a line that says what the paper's stability theorem says about a run.
+    """Returns a line on what the paper's stability theorem says about a run.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -370,7 +374,11 @@ _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 
 
 def _mark_twins(twins: TwinGrowth) -> str:
-    """Returns the mark of the sentence about twins, see `CertificateLine`."""
+    """Returns the mark of the sentence about twins: "ok" if all pushes die away.
+
+    It is "FAIL" if a push grows or its repetition leaves the run, "note" without pushes, and
+    "open" otherwise.
+    """
     if not twins.pushes:
         return "note"
     if twins.grows or twins.departure is not None:
@@ -445,7 +453,11 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of V that no listed energy explains, shape (T,), in J."""
+    """Returns the change of V that no listed energy explains, shape (T,), in J.
+
+    The table of energies lists it as "unexplained". It should be close to 0, except in gaps of
+    the records.
+    """
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
     explained = gained - lost + balance.sampling - balance.transfer

@@ -147,7 +147,10 @@ class ChartBuilder:
         self._buckets = max(_MIN_BUCKETS, min(_MAX_BUCKETS, buckets))
 
     def build(self) -> _PageCharts:
-        """Computes all charts of the page.
+        """Computes all charts of the page: overview, motion of the arms, and timing.
+
+        A chart without any curve, for example of a law that has no estimates, is left out. The
+        page mentions the titles of such charts by section.
 
         Returns:
             The data of the page, and the titles of the charts that are left out.

@@ -67,6 +67,8 @@ _STATEMENTS = {
 def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
     """Yields a paragraph for a paper about a run, and then its references as BibTeX.
 
+    The paragraph states the scenario, the judgement and its basis, and the program.
+
     Args:
         log: The log of the run.
         certificate: Judgement whether the run was stable, with its reasons.

@@ -192,7 +192,7 @@ def _get_quantity(column: Column) -> str:
 
 
 def _get_stem(column: Column) -> str:
-    """Returns the name of a column without its unit."""
+    """Returns the name of a column without its unit, such as "q1" for "q1_rad"."""
     suffix = UNIT_SUFFIXES.get(column.unit, "")
     return column.name.removesuffix(f"_{suffix}") if suffix else column.name
 

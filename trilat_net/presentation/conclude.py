@@ -88,7 +88,7 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """Path of the HTML report of the run.
+        """The file that the user should open first: the HTML report of the run.
 
         If no report was written, it is the path of the first log file.
         """
@@ -106,12 +106,19 @@ class Conclusion(CheckReport):
         return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
-        """Returns the table of sites as dictionaries of texts, one per site."""
+        """Returns the table of the sites, one dictionary per site.
+
+        The keys are the headers of the columns. The values are texts, as in the terminal.
+        """
         headers = self.table.headers
         return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat report --json` prints them."""
+        """Converts the result to plain values, as `trilat report --json` prints them.
+
+        The entries have the outcome ("passed", "verdict"), its explanation for people
+        ("meaning", "notes"), the single checks, and the paths of the files.
+        """
         return {
             "passed": self.passed,
             "verdict": self.verdict.text,
@@ -131,6 +138,9 @@ def conclude(
     png: bool = False,
 ) -> Conclusion:
     """Checks the log of a finished run, and writes its page and summary into a folder.
+
+    The checks execute the log again in a second process, while this process judges the run and
+    draws the figures.
 
     Args:
         log: Log that was opened from files.

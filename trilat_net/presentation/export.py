@@ -185,7 +185,9 @@ def store_tables(
     choose_name: Callable[[Table], str],
     store: Callable[[Table, str], Any],
 ) -> str:
-    """Stores every table of a log, and describes the export.
+    """Stores every table of a log by a function of the export format, and describes the export.
+
+    Formats that write one file, such as NumPy's, use it.
 
     Args:
         log: Log of the run that is exported.
@@ -224,6 +226,8 @@ def write_table_files(
     write_table: Callable[[Table, Path], None],
 ) -> None:
     """Writes every table of a log as a file, their description and the scenario into a folder.
+
+    Formats with a file per table, such as CSV, use it.
 
     Args:
         log: Log of the run that is exported.
@@ -282,6 +286,8 @@ def name_inside(table: Table, name: str, separator: str) -> str:
 
 def read_texts(column: Column) -> NDArray[Any]:
     """Reads the texts of a column as an array of NumPy strings, shape (K,).
+
+    Formats for numbers store texts in this way.
 
     Args:
         column: Column of a table with K rows.

@@ -92,7 +92,7 @@ class _Panels:
         return identifier
 
     def add_tabs(self, trees: Mapping[str, Tree]) -> str:
-        """Adds a panel that contains tabs, and returns its identifier.
+        """Adds a panel whose tabs contain other panels, and returns its identifier.
 
         Args:
             trees: Contents of each tab, by its title.

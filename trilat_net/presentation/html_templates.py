@@ -26,7 +26,9 @@ _CODE = re.compile(r"`([^`]+)`")
 
 
 def render_template(name: str, /, **values: Any) -> Markup:
-    """Renders a whole template.
+    """Renders a whole template, such as the page of a report.
+
+    Values that are plain strings are escaped.
 
     Args:
         name: File name of the template.
@@ -36,7 +38,7 @@ def render_template(name: str, /, **values: Any) -> Markup:
 
 
 def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
-    """Renders a macro of a template.
+    """Renders a macro, a part of a template with parameters, such as a table.
 
     Args:
         template: File name of the template.

@@ -64,6 +64,8 @@ _BALANCE_NOTE = (
 def render_certificate(log: Log, certificate: Certificate) -> Markup:
     """Renders the section about stability: the reasons, and folded tables and figures.
 
+    The judgement itself stands at the beginning of the page.
+
     Args:
         log: Log of the run.
         certificate: Judgement whether the run was stable, with its reasons.
@@ -107,7 +109,12 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
 
 
 def _lengthen_name(sentence: str) -> str:
-    """Returns a sentence of a certificate with the long name of the check that it is about."""
+    """Replaces the short name at the beginning of a sentence by a name for readers of the page.
+
+    `describe_certificate` begins each sentence with the name of the check that it is about and
+    a colon. The short names fit a terminal. A name that is not in `_LONG_NAMES` remains, as
+    does a sentence without a colon.
+    """
     name, colon, rest = sentence.partition(": ")
     return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
 

@@ -43,7 +43,9 @@ class ColumnTable(msgspec.Struct, frozen=True):
 
 
 class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of a chart over time. It draws one column of a `ColumnTable`.
+    """A line of a chart over time, which draws one column of a `ColumnTable`.
+
+    Several charts may draw from the same table, so that the page contains its numbers once.
 
     Attributes:
         label: Name of the line in the legend.
@@ -62,6 +64,8 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
 
 class HistogramSeries(msgspec.Struct, frozen=True):
     """A line of a histogram, which shows how often the times of a site lie in each bin.
+
+    The bins belong to the chart, and are the same for all of its lines.
 
     Attributes:
         label: Name of the line in the legend.
@@ -251,6 +255,8 @@ class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
 class MarkedChange(msgspec.Struct, frozen=True):
     """A change during the run that charts mark, such as another delay of a link.
 
+    The number n connects the mark with the row of the table that explains the change.
+
     Attributes:
         n: Number in the table of changes.
         t: Time from which the change applies, in s.
@@ -283,7 +289,7 @@ class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the sites, as CSS writes them.
+    """Colours of the sites, in the order of the scenario, as CSS writes them: "#004488".
 
     Attributes:
         light: Colours for light screens.
@@ -321,6 +327,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Converts the data to dictionaries, lists and plain values, ready for JSON."""
+        """Converts the data to plain values, which the page contains as JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

@@ -34,7 +34,7 @@ def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Ma
 
 
 def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Markup:
-    """Renders content that the reader can unfold.
+    """Renders content that the reader can unfold, so that the page stays short at first.
 
     Args:
         summary: Line that is always visible, as plain text.
@@ -47,6 +47,8 @@ def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Mark
 def render_folds(folds: Iterable[Markup]) -> Markup:
     """Renders parts that unfold, side by side while they are folded.
 
+    Details that few readers need take one line in this way.
+
     Args:
         folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
     """
@@ -54,12 +56,15 @@ def render_folds(folds: Iterable[Markup]) -> Markup:
 
 
 def render_note(text: str) -> Markup:
-    """Renders a string as a paragraph in small type."""
+    """Renders a remark as a paragraph in small type, for example below a chart."""
     return _render("note", text=text)
 
 
 def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
-    """Renders a table with two columns: the name and the text of each fact."""
+    """Renders a table with two columns: the name and the text of each fact.
+
+    If the table is wider than the screen, it scrolls inside its own frame.
+    """
     return render_scrolling(_render("facts", facts=facts), "facts")
 
 
@@ -82,13 +87,24 @@ def render_table(
 
 
 def render_legend(columns: Mapping[str, str]) -> Markup:
-    """Renders the meanings of a table's columns as a line, for screens without a pointer."""
+    """Renders the meanings of a table's columns as a line, for screens without a pointer.
+
+    With a pointer, a reader sees the meaning of a column at its header.
+
+    Args:
+        columns: Meanings of the columns by header. Columns with an empty meaning are left out.
+
+    Returns:
+        The line. Empty if no column has a meaning.
+    """
     items = [f"{header}: {meaning}" for header, meaning in columns.items() if meaning]
     return _render("legend", text="; ".join(items)) if items else Markup()
 
 
 def render_scrolling(content: Markup, label: str) -> Markup:
     """Renders HTML in a region that scrolls sideways, also by the keyboard.
+
+    The page itself then never becomes wider than the screen.
 
     Args:
         content: HTML of the content of the region.
@@ -98,18 +114,24 @@ def render_scrolling(content: Markup, label: str) -> Markup:
 
 
 def render_code(text: str) -> Markup:
-    """Renders lines of commands or of a file as they are."""
+    """Renders commands or the content of a file in a fixed-width type, with its line breaks."""
     return _render("code", text=text)
 
 
 def label_site(log: Log, name: str) -> Markup:
-    """Renders the name and the role of a site, behind a square in the colour of the site."""
+    """Renders the label of a site in a table, for example "m1 (master)".
+
+    A square before it has the colour that the site has in all charts.
+    """
     role = log.scenario.sites[name].role
     return _render("labelled", index=log.sites.index(name), text=f"{name} ({role})")
 
 
 def label_link(log: Log, link: str) -> Markup:
-    """Renders the name of a link, as in "m1 → s", behind a square in its sender's colour."""
+    """Renders the label of a link in a table, for example "m1 → s" for the link "m1->s".
+
+    A square before it has the colour of the sending site.
+    """
     peer, site = link.split("->")
     return _render("labelled", index=log.sites.index(peer), text=f"{peer} → {site}")
 
@@ -120,9 +142,10 @@ def _render(macro: str, **values: Any) -> Markup:
 
 
 def format_cell(value: float | None) -> str:
-    """Returns a number as text: an integer with all digits, or four digits of another number.
+    """Returns the text of a number in a table, such as "15000" or "0.1235" for 0.12346.
 
-    Returns a dash for None.
+    Integers have all digits, other numbers four significant digits. A missing number (None) is
+    a dash.
     """
     if value is None:
         return NO_NUMBER
@@ -130,12 +153,15 @@ def format_cell(value: float | None) -> str:
 
 
 def format_numbers(values: Iterable[float] | None) -> str:
-    """Returns numbers with four decimals, separated by commas. Returns a dash for None."""
+    """Returns numbers as one cell of a table, for example "0.1000, -0.2500".
+
+    None, for values that do not exist, gives a dash.
+    """
     if values is None:
         return NO_NUMBER
     return ", ".join(f"{value:.4f}" for value in values)
 
 
 def to_percent(share: float | None) -> float | None:
-    """Returns a share between 0 and 1 in percent. Returns None for None."""
+    """Converts a share from 0 to 1 to percent. None, an unknown share, stays None."""
     return None if share is None else 100.0 * share

@@ -54,7 +54,10 @@ class _Lead(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """True if no factor changes during the run."""
+        """True if no dominance factor of the slave changes during the run.
+
+        A sentence then says all, and a bar over time would show nothing.
+        """
         return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
 
 
@@ -71,12 +74,14 @@ def _name_role(scenario: Scenario, site: str) -> str:
 
 
 def caption_site(scenario: Scenario, site: str) -> str:
-    """Returns the name and the role of a site, as in "m1, master 1"."""
+    """Returns the caption of a site's arm in the drawing, for example "m1, master 1"."""
     return f"{site}, {_name_role(scenario, site)}"
 
 
 def trace_leads(log: Log) -> list[_Lead]:
-    """Traces with which weights each slave follows its peers.
+    """Traces with which weights each slave follows its peers over the run.
+
+    The bars, the sentences and the slider of the page use the same data.
 
     Args:
         log: Log of the run.
@@ -111,7 +116,10 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that a line through the other points would miss."""
+    """Returns the indices of the points that are needed to draw the shares as a line.
+
+    Points on a straight line between others are left out. The first and the last are kept.
+    """
     slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
     turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
     corners = np.flatnonzero(turns > _SAME_SHARE) + 1
@@ -138,7 +146,7 @@ def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
 
 
 def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
-    """Renders a bar for each slave whose dominance factors change.
+    """Renders a bar for each slave whose dominance factors change, with an area for each peer.
 
     Args:
         log: Log of the run.
@@ -149,6 +157,8 @@ def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
 
 def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
     """Returns a sentence for each slave whose dominance factors never change.
+
+    The other slaves have bars, see `render_lead_bars`.
 
     Args:
         log: Log of the run.

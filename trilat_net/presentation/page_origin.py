@@ -37,6 +37,8 @@ _MAX_CHANGES = 3
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     """Renders the section with the commands, the scenario, the assumptions and the versions.
 
+    With these, a reader can repeat the run.
+
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.
@@ -60,6 +62,8 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
 
 def summarise_origin(log: Log) -> str:
     """Returns the name, length and origin of a run in one line, for the head of the page.
+
+    The origin is, for example, a live session or virtual time.
 
     Args:
         log: Log of the run.

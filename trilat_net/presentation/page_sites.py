@@ -45,7 +45,7 @@ _ANGLE_COLUMNS = {
 
 
 def render_sites(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with the records and the motion of each site.
+    """Renders the section with the records and the motion of each site, as tables.
 
     Args:
         log: Log of the run.
@@ -102,6 +102,8 @@ _LOOP_COLUMNS = {
 
 def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section with the timing of each site's control loop.
+
+    It shows how punctual the ticks were, and how long they took to compute.
 
     Args:
         log: Log of the run.

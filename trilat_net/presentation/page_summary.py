@@ -216,6 +216,8 @@ class _KeyNumber(NamedTuple):
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
     """Renders the numbers that describe the run best: its errors and the delay in use.
 
+    They stand below the judgement, for readers who read nothing else.
+
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.

@@ -73,7 +73,7 @@ class _RunMoment(NamedTuple):
 
 
 def render_timeline(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with what happened, in the order of time.
+    """Renders the section with what happened during the run, in the order of time.
 
     Args:
         log: Log of the run.
@@ -103,7 +103,7 @@ def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
 
 
 def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
-    """Lists what happened in a run, in the order of time.
+    """Lists what happened in a run, in the order of time: changes, pushes, modes and errors.
 
     Args:
         log: Log of the run.

@@ -72,7 +72,7 @@ def shared_unit(log: Log) -> str:
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the age of each peer's sample in use, in ms.
+    """Returns how old each peer's sample in use is at every record of a site, in ms.
 
     Args:
         log: The log of the run.

@@ -68,7 +68,9 @@ def find_plugin_actions(log: Log, site: str) -> str:
 def observe_as_plugin(
     log: Log, slave: str, site: str, rows: Mapping[str, Ints]
 ) -> tuple[Array, list[str]]:
-    """Returns the plugin's observation in every frame.
+    """Returns the observation that the LeRobot plugin would have made in every frame of a log.
+
+    A policy can then be trained from logs, and later run by the plugin.
 
     Args:
         log: Log of the run.

@@ -217,6 +217,8 @@ class _PlotCurves(NamedTuple):
 class CurvePlot(NamedTuple):
     """A plot of one quantity of one site over time, on a page of the viewer.
 
+    For example the joint angles of m1, with the actual and the desired curves.
+
     Attributes:
         title: Title of the plot, with its unit.
         curves: Curves of each of its channels.

@@ -62,7 +62,7 @@ class TextTable(NamedTuple):
 
     @property
     def titles(self) -> list[str]:
-        """Headers of the columns, each followed by its unit."""
+        """Headers of the columns, each followed by its unit, such as "error rad"."""
         missing = len(self.headers) - len(self.units)
         units = [*self.units, *[""] * missing]
         columns = zip(self.headers, units, strict=False)
@@ -70,7 +70,11 @@ class TextTable(NamedTuple):
 
     @property
     def to_the_right(self) -> list[bool]:
-        """For each column, True if its cells are aligned to the right."""
+        """For each column, True if its cells are aligned to the right, as numbers are.
+
+        If `align` has fewer letters than there are columns, its last letter holds for the
+        others.
+        """
         letters = self.align.ljust(len(self.headers), self.align[-1])
         return [letter == "r" for letter in letters]
 
@@ -121,7 +125,10 @@ class TextTable(NamedTuple):
         return all(len(cell) <= width for cell in self._list_cells(index))
 
     def markdown(self) -> str:
-        """Renders the table in Markdown, for a page."""
+        """Renders the table in Markdown. Short rows are filled with empty cells.
+
+        A "|" in a cell is escaped, because it would begin a new column.
+        """
         rule = ["--:" if right else "---" for right in self.to_the_right]
         rows = [self.titles, rule]
         for row in self.rows:
@@ -134,7 +141,7 @@ class TextTable(NamedTuple):
         return "\n".join(lines)
 
     def html(self) -> "Markup":
-        """Renders the table in HTML, for a notebook or a page."""
+        """Renders the table as HTML, for notebooks and for the page of a report."""
         from .html_templates import render_macro
 
         titles = self.titles
@@ -149,7 +156,8 @@ class TextTable(NamedTuple):
     def lines(self) -> list[str]:
         """Renders the table as plain lines, with columns aligned by spaces.
 
-        The first line has the headers, unless all headers are empty.
+        The first line has the headers, unless all headers are empty. Each column is as wide as
+        its longest cell.
         """
         table = list(self.rows)
         if any(self.titles):
@@ -170,7 +178,7 @@ class TextTable(NamedTuple):
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Formats a number as a cell of a table.
+    """Formats a number as a cell of a table. A dash stands for None.
 
     Args:
         value: The number, or None.
@@ -196,7 +204,7 @@ class MarkedText(NamedTuple):
     failed: bool = False
 
     def lines(self) -> list[str]:
-        """Returns the mark and the text in one line, without colours.
+        """Returns the mark and the text in one line without colours: "ok all records".
 
         Returns:
             A list with this line, because other parts of a result have several lines.
@@ -207,7 +215,11 @@ class MarkedText(NamedTuple):
         return [f"{mark} {self.text}"]
 
     def html(self) -> "Markup":
-        """Renders the mark and the text as a line in HTML, without colours."""
+        """Renders the mark and the text as one line of HTML, without colours.
+
+        The text may come from a file or from another computer. Therefore control characters are
+        replaced, and very long texts are cut.
+        """
         from .html_templates import render_macro
 
         line = sanitize(self.lines()[0], MAX_LETTERS)
@@ -239,6 +251,8 @@ _BRIEF_COMPOSERS = {
 
 def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
     """Collects the blocks of a result's text: lines and tables.
+
+    Terminal, plain text and HTML all render these blocks.
 
     Args:
         result: What a command has computed, such as the measured numbers of a run.

@@ -138,7 +138,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels to a figure.
+    """Adds a grid of panels, parts of the figure with axes of their own.
 
     Args:
         figure: The Matplotlib figure.
@@ -154,7 +154,7 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
 
 
 def site_colour(log: Log, site: str) -> str:
-    """Returns the colour of a site, which is the same in every figure.
+    """Returns the colour of a site, which is the same in every figure of the log.
 
     Args:
         log: Log with the site.
@@ -210,6 +210,8 @@ def site_title(log: Log, site: str) -> str:
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
     """Draws a signal over time with fewer points, such that all extremes stay visible.
 
+    A run has up to millions of values, far more than a figure has pixels.
+
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         tick: Ticks of the values, shape (K,).
@@ -223,6 +225,8 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
 
 def positive(values: Array) -> Array:
     """Replaces zero and negative values by NaN, as a logarithmic axis cannot show them.
+
+    A line has a gap at NaN, while zero would draw it to the edge of the panel.
 
     Args:
         values: The values.
@@ -328,7 +332,7 @@ def name_shared(log: Log) -> list[str]:
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes titles above a row of panels, one for each joint.
+    """Writes a title, such as the joint's name, above each panel of a row.
 
     Args:
         log: Log with the joints.
@@ -341,6 +345,8 @@ def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> N
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
     """Writes a label beside a row of low panels, in several lines.
+
+    A low panel has no room beside it for a long label in one line.
 
     Args:
         axes: First panel of the row, beside which the label is written.
@@ -455,6 +461,8 @@ def add_joint_panels(
 def typeset(text: str) -> str:
     """Replaces "+-" and "->", as the terminal shows them, by the signs ± and →.
 
+    For example "m1->s: 3 +- 1" becomes "m1 → s: 3 ± 1".
+
     Args:
         text: A text for the terminal.
     """
@@ -462,7 +470,7 @@ def typeset(text: str) -> str:
 
 
 def typeset_unit(unit: str) -> str:
-    """Replaces "^2" in a unit by the sign ².
+    """Replaces "^2" in a unit by the sign ²: "rad/s^2" becomes "rad/s²".
 
     Args:
         unit: The unit, such as "rad/s^2".
@@ -471,7 +479,7 @@ def typeset_unit(unit: str) -> str:
 
 
 def typeset_symbol(parameter: str) -> str:
-    """Returns the symbol of an inertial parameter, with its index as a subscript.
+    """Returns the symbol of an inertial parameter for Matplotlib, with its index below.
 
     Args:
         parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
@@ -544,6 +552,8 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns a figure that contains only the reason why there is nothing to draw.
 
+    A command that writes a figure thus always writes a file.
+
     Args:
         text: The reason.
         form: Width, type sizes and resolution of the figure.
@@ -556,7 +566,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes the reason why a panel is empty into the panel.
+    """Writes into an empty panel why there is nothing to show.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -582,7 +592,7 @@ _UNDATED: dict[str, dict[str, Any]] = {
 
 
 def write_figure(figure: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure to a file.
+    """Writes a figure to a file, in the format that the suffix of the file names.
 
     Args:
         figure: The Matplotlib figure.
@@ -736,7 +746,7 @@ class TimeFigure:
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
     ) -> None:
-        """Draws a line over time with one value for each record of a site.
+        """Draws a line over time with a value for each record of a site, in the site's colour.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.

@@ -92,7 +92,7 @@ def print_note(text: object) -> None:
 
 
 def print_error(text: object) -> None:
-    """Prints an error message to standard error.
+    """Prints an error message to standard error, so that it does not disturb results.
 
     Args:
         text: The message.
@@ -169,6 +169,8 @@ def print_table(table: "TextTable") -> None:
 
 def print_result(result: "Result", *, as_json: bool = False, brief: bool = False) -> None:
     """Prints the result of a command, as text for people or as JSON for programs.
+
+    All commands with results end with this call, so that their output is uniform.
 
     Args:
         result: The result of a command.
@@ -280,7 +282,15 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     drawn_s = start_s
 
     def show(done: int, total: int) -> None:
-        """Draws the progress, unless the last drawing was very recent."""
+        """Draws the progress of a command, for example 12 of 50 runs.
+
+        The bar appears only if the command takes longer than `PATIENCE_S`. Drawings that follow
+        each other too quickly are left out, because they would slow down the work.
+
+        Args:
+            done: Number of finished items.
+            total: Number of all items.
+        """
         nonlocal drawn_s
         now_s = display.get_time()
         if now_s - start_s < PATIENCE_S:

@@ -30,7 +30,10 @@ CONFIG_SUFFIX = ".rviz"
 
 
 def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
-    """Writes the layout of a log or a bag for Foxglove and Lichtblick.
+    """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
+
+    With the layout, the viewer opens with plots of all sites, and nothing needs to be arranged
+    by hand.
 
     Args:
         log: File of the log or bag.
@@ -61,7 +64,7 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
 
 
 def write_rviz_config(log: Path, *, force: bool = False) -> Path:
-    """Writes a configuration of RViz for the session of a log, or for a bag.
+    """Writes a configuration of RViz, the viewer of ROS, for the session of a log or for a bag.
 
     Args:
         log: File of the log or bag.

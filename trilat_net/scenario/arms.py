@@ -136,7 +136,7 @@ class Arm(fields.Frozen, frozen=True):
     links: dict[str, LinkInertia] = msgspec.field(default_factory=dict)
 
     def planar_links(self) -> ArmLinks:
-        """Returns the lengths, masses and inertias of the planar arm of two links.
+        """Returns the lengths, masses and inertias of the two links of a planar arm.
 
         They are meaningless if the arm is a chain from a URDF file.
         """
@@ -187,9 +187,9 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of coordinates that the sites share in task space.
+        """Number of coordinates that sites share in task space: 3 for positions, 6 for poses.
 
-        It is 0 if the sites share joint angles.
+        It is 0 if the sites share joint angles, whose number depends on the arm.
         """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
@@ -261,7 +261,7 @@ class ArmModel(NamedTuple):
         speeds: Largest speed of each joint according to the file, in rad/s or m/s. inf if the
             file does not state it.
         lengths_m: Lengths of the two links of the planar arm. (0, 0) for a chain.
-        chain: Chain in the form that the simulation kernel uses. None for the planar arm.
+        chain: Chain as the record that the simulation kernel reads. None for the planar arm.
     """
 
     theta: Array
@@ -275,9 +275,10 @@ class ArmModel(NamedTuple):
 
     @property
     def parameters(self) -> list[tuple[str, str]]:
-        """Name and unit of each inertial parameter, in the order of `theta`.
+        """Label and unit of each inertial parameter, in the order of `theta`.
 
-        Figures and messages use them as labels.
+        The planar arm has "theta_1", "theta_2" and so on. A chain names the link and the
+        quantity. Figures and messages use these labels.
         """
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
@@ -391,6 +392,9 @@ class ArmModel(NamedTuple):
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
         """Returns the range of each joint that its mechanical stops and position limits permit.
 
+        The stops belong to the arm, and the limits to the scenario. The narrower of both
+        counts.
+
         Args:
             limits: Position limits of the site that runs the arm.
         """
@@ -404,7 +408,7 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the sites share the position or pose of their end effectors.
+        """True if the sites share the position or pose of their end effectors (task space).
 
         Otherwise they share their joint angles.
         """
@@ -414,6 +418,7 @@ class ArmModel(NamedTuple):
     def axes(self) -> tuple[float, ...]:
         """For each task coordinate, 1 if the site follows its peers along it, and 0 if not.
 
+        For example (1, 1, 0) for an end effector that follows in x and y, and is free in z.
         Empty if the sites share joint angles.
         """
         task = None if self.chain is None else self.chain.task
@@ -437,7 +442,9 @@ class ArmModel(NamedTuple):
         return (*position.tolist(), *self.end_effector_orientation(q))
 
     def task_jacobian(self, q: Vector) -> Array:
-        """Returns the matrix that converts joint velocities to those of the task coordinates.
+        """Returns the Jacobian J that converts joint velocities to task velocities: xd = J qd.
+
+        Task coordinates are those that sites share if their end effectors follow each other.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -556,7 +563,7 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
 
 
 def _list_planar_bodies(arm: Arm) -> Array:
-    """Returns the planar arm's inertial parameters in the form of a chain, shape (20,).
+    """Returns the planar arm's inertial parameters as those of a chain, shape (20,).
 
     A link has the mass m, its centre of mass at (c, 0, 0), and the moment of inertia I about
     the z axis through the centre of mass. About its joint, the first moment along x is m c, and
@@ -723,7 +730,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Returns a joint in the form that the simulation kernel uses.
+    """Returns a joint as the record that the simulation kernel reads.
 
     A stop is a spring that pushes with the effort limit of the joint at the depth
     `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the stiffness.

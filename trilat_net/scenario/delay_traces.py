@@ -169,6 +169,8 @@ def _is_number(cell: str) -> bool:
 def read_trace(path: Path, link: str) -> str:
     """Reads a delay trace from a CSV file, or from the log of a run.
 
+    A trace of a real network lets a simulation repeat its delays.
+
     Args:
         path: CSV file with the columns `t_s,delay_ms`, or a log.
         link: Name of the link whose delays are taken from a log, for example "m1->s".
@@ -192,7 +194,7 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns a delay trace as a string, in the form in which a scenario contains it.
+    """Returns a delay trace as the string that a scenario contains.
 
     A delay trace is a table of send times and the delay that each message had. The form of the
     text is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the
@@ -248,7 +250,7 @@ def parse_trace(text: str) -> Points:
     cached, because the trace of a link is needed many times.
 
     Args:
-        text: Trace in the form that `format_trace` returns.
+        text: Trace as a string that `format_trace` returned.
 
     Returns:
         Read-only array of times and delays in microseconds, shape (n, 2). A lost message has
@@ -329,7 +331,10 @@ class MeasuredTrace(Result):
 
     @property
     def delay_ms(self) -> Array:
-        """Delays of all messages that were not lost, in ms, in the order of sending."""
+        """Delays of all messages that were not lost, in ms, in the order of sending.
+
+        Statistics of the measured network are computed from them.
+        """
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:

@@ -72,7 +72,7 @@ def lacks_detailed_balance(scenario: Scenario) -> bool:
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link in s, in the form of `LawSituation.delay_s`.
+    """Returns the delay of every link in s, as `LawSituation.delay_s` contains it.
 
     A constant delay is rounded up to whole ticks of the receiver. The other delays are NaN.
 
@@ -147,7 +147,11 @@ _TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
 
 
 def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each site, its control law, and the facts on which its stability depends."""
+    """Yields each site, its control law, and the facts on which its stability depends.
+
+    The facts, such as delays, dominance factors and tick rates, are the input of the stability
+    condition that a law may have.
+    """
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
     hold_s = _find_hold_time(scenario)
@@ -282,7 +286,11 @@ def _format_per_joint(values: Any, units: Sequence[str]) -> str:
 
 
 def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
-    """Joins the texts of all joints, with the units, and shortens what is equal."""
+    """Joins the texts of all joints to one, and writes equal texts or units only once.
+
+    For example, the texts "1", "1" with the unit "rad" give "1 rad", and "1", "2" give "1, 2
+    rad".
+    """
     if len(set(units)) > 1:
         return ", ".join(f"{text} {unit}" for text, unit in zip(texts, units, strict=True))
     return f"{texts[0] if len(set(texts)) == 1 else ', '.join(texts)} {units[0]}"
@@ -541,7 +549,7 @@ _MAX_VALUE_LENGTH = 80
 
 
 class ScenarioDifference(NamedTuple):
-    """One key in which several experiments differ.
+    """One key in which several experiments differ, as a row of a comparison.
 
     Attributes:
         key: Dotted path of the key, without `sites.NAME` for a key of a site.
@@ -560,7 +568,7 @@ class ScenarioDifference(NamedTuple):
 
 
 def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the keys in which several experiments differ.
+    """Finds the keys in which several experiments differ, including keys that only some have.
 
     Args:
         scenarios: Descriptions of at least two experiments.

@@ -95,8 +95,9 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yields each quantity that is checked in this part of a run, with its limits.
 
-        Each item is the name of the quantity, whose ending states the unit, and a pair of the
-        smallest and the largest permitted value. Yields nothing if no quantity is checked.
+        An item is, for example, the name of a quantity, which ends in its unit, and the pair
+        (0.0, 0.01) of the smallest and the largest permitted value. Yields nothing if no
+        quantity is checked.
         """
         for key in _QUANTITIES:
             limits = getattr(self, key)
@@ -302,9 +303,10 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if the scenario states at least one expectation that a run must satisfy.
+        """True if the scenario states at least one condition that its runs must satisfy.
 
-        A tolerance alone is not an expectation.
+        A tolerance alone only says how precisely other conditions are judged, and does not
+        count.
         """
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()
@@ -312,6 +314,9 @@ class Expect(
 
 def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
     """Returns the reason why no run could satisfy the expectations of a scenario.
+
+    For example, an expected end pose must have as many angles as the arm has joints. The
+    problem is reported when the scenario is loaded, and not after a long run.
 
     Args:
         expect: The expectations.

@@ -137,7 +137,7 @@ _SINGULAR = {
 
 
 def describe_wrong_type(value: Any, expected: str) -> str:
-    """Returns the problem of a value of a scenario that has the wrong type.
+    """Returns what is wrong with a value of a scenario that has another type than expected.
 
     Args:
         value: The value as it was read from TOML.
@@ -221,6 +221,8 @@ def check_keys(
 ) -> TomlTable:
     """Checks that a value of a scenario is a table that contains only valid keys.
 
+    The error suggests the key that the author may have meant.
+
     Args:
         table: A value of a scenario.
         valid: The keys that the table may have.
@@ -248,7 +250,7 @@ def check_keys(
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:
-    """Returns the keys that a table of a scenario may have.
+    """Returns the keys that a table of a scenario may have: the fields of its type.
 
     Args:
         kind: Type of the table.
@@ -257,7 +259,7 @@ def field_names(kind: StructType) -> tuple[str, ...]:
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Checks that a word of a scenario is among the valid ones.
+    """Checks that a word of a scenario, such as the name of a law, is among the valid ones.
 
     Args:
         word: A value of a scenario.

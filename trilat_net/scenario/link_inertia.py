@@ -50,9 +50,9 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the names of the inertial parameters that the author of the scenario stated.
+        """Returns the names of the inertial parameters that the scenario states for the link.
 
-        The parameters that are not in the list are taken from the URDF file of the arm.
+        The others are taken from the URDF file of the arm.
         """
         keys = field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]

@@ -74,7 +74,11 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
 
 
 def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
-    """Returns overrides in which a table for a whole group is replaced by its single keys."""
+    """Replaces each override of a whole group of keys by overrides of the single keys.
+
+    For example, `limits={q_max_rad=3}` becomes `limits.q_max_rad=3`, so that other keys of the
+    group keep their values.
+    """
     flat_pairs: list[Override] = []
     for key, value in pairs:
         is_group = key in SITE_GROUPS or key in _KIND_KEYS
@@ -391,7 +395,9 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
 
 
 def split_assignment(text: str) -> Override | None:
-    """Splits a text KEY=VALUE into its key and its value.
+    """Splits a text KEY=VALUE, as the option --set has it, into its key and its value.
+
+    For example, "links.delay_ms=5" gives the key "links.delay_ms" and the value 5.
 
     Args:
         text: The text. A value that is not valid TOML is a bare word, and is taken as a string.

@@ -220,6 +220,8 @@ class PlantPlayer:
 def make_plant_players(scenario: Scenario) -> dict[str, PlantPlayer]:
     """Creates the users' plants of all sites that have one.
 
+    A plant is a user's class that computes the motion of an arm in place of this program.
+
     Args:
         scenario: Description of the experiment.
 

@@ -82,6 +82,9 @@ class _ArmSamples(NamedTuple):
 def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> _RestBounds:
     """Computes bounds of the time, energy and speeds with which an arm comes to rest.
 
+    A user needs them before a real arm moves: how long and how fast may it still move after a
+    stop?
+
     Args:
         scenario: Description of the experiment. The site must have the stale rule "glide",
             under which damping brings the arm to rest when the site stops.

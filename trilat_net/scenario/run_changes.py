@@ -48,7 +48,7 @@ class LinkTables(dict[str, dict[str, Any]]):
         self._planned = deque(change for change in timeline if change.link)
 
     def advance_to(self, t_ns: int) -> None:
-        """Applies the planned changes that take effect up to a time.
+        """Applies the planned changes up to a time, so that the tables are valid at this time.
 
         Args:
             t_ns: The time, in ns after the epoch (the common start time).
@@ -192,7 +192,7 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
 
 
 def find_requester(sentence: str) -> str:
-    """Extracts from the sentence about a stop who requested it.
+    """Extracts from the sentence about a stop who requested it, for the timeline of a report.
 
     Args:
         sentence: Sentence that `describe_change` returned.

@@ -39,12 +39,12 @@ class LinkSchedule:
     applies to samples that are sent at its first stamp or later.
 
     Args:
-        setup: Setup of the link in the form that the kernel uses.
+        setup: Setup of the link, as the kernel reads it.
         changed_models: Models of delay and loss that the link gets by changes during the run.
 
     Attributes:
         models: All models of the link, in the order of their first stamps.
-        row: Row of the link in the form that the kernel uses.
+        row: State of the link: a row of the array that the kernel reads.
     """
 
     def __init__(self, setup: LinkSetup, changed_models: Sequence[LinkModel] = ()) -> None:
@@ -124,7 +124,9 @@ class LinkSchedule:
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first tick at or after each of some times, like `core.ticks.first_tick_at`.
+    """Returns the first tick at or after each of some times at which samples are due.
+
+    It computes the same as `core.ticks.first_tick_at`, for an array of times.
 
     Args:
         due_ns: Times in ns after the epoch (the common start time).

@@ -76,6 +76,8 @@ def read_shipped(name: str) -> str:
 def read_template() -> str:
     """Returns the text that `trilat scenario new` writes: a valid scenario with comments.
 
+    A user edits the text to describe an experiment.
+
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
     """
@@ -173,7 +175,7 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Checks and completes the description of an experiment.
+        """Checks and completes the description of an experiment, after overrides of its keys.
 
         Args:
             overrides: Texts KEY=VALUE, each of which replaces one value of the description. By
@@ -256,7 +258,7 @@ def read_source(source: str | Path) -> tuple[str, Path]:
 
 
 def find_site(scenario: Scenario, name: str) -> SiteSpec:
-    """Looks up a site of a scenario by its name.
+    """Looks up a site of a scenario by its name, with a helpful error for a wrong name.
 
     Args:
         scenario: Description of the experiment.
@@ -287,7 +289,7 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Converts a TOML text to a checked scenario.
+    """Converts a TOML text to a checked scenario, in which every key has a value.
 
     Args:
         text: TOML text of a scenario file.

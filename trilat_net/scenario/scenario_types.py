@@ -99,7 +99,8 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     def rule(self) -> site_setup.StaleRule:
         """Reaction to missing messages of another site, as a record for the control loop.
 
-        A site is the process that runs one arm. Times in the record are in ns.
+        The scenario states times in ms, and the record in whole ns, because the kernel computes
+        with integers.
         """
         if self.action == "glide":
             return site_setup.StaleRule(
@@ -163,10 +164,10 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> site_setup.MotionLimits:
-        """Limits of joint angles, reference speed and torque rate, for the control loop.
+        """Limits of joint angles, reference speed and torque rate, as a record for the kernel.
 
-        This is the record that the compiled control loop reads. A limit that the author of the
-        scenario left out is infinite.
+        A limit that the author of the scenario left out is infinite, so that the kernel needs
+        no special case.
         """
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -251,22 +252,26 @@ TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
 class Change(RecordedChange, frozen=True, omit_defaults=True):
     """Change of a link or of dominance factors, or a command to a site.
 
-    A scenario plans changes in its timeline; users request further ones during a run. Exactly
-    one of `link`, `dominance` and `site` is not empty. Only the changes in records of a run
-    have `site`.
+    A scenario plans changes in its timeline, and users request further ones during a run.
+    Exactly one of `link`, `dominance` and `site` is not empty, and says what is changed. Only
+    the changes in records of a run have `site`.
     """
 
     @property
     def start_ns(self) -> int:
         """Time at which the change takes effect, in ns after the epoch.
 
-        The epoch is the common start time of the sites.
+        The epoch is the common start time of the sites. Times of the simulation are integers,
+        so that they are the same on every machine.
         """
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """All settings of the link after this change. Only a change of a link has them."""
+        """All settings of the link after this change, not only those that change.
+
+        Only a change of a link has them.
+        """
         return msgspec.convert(self.to, Link)
 
 
@@ -387,7 +392,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, in the order of the scenario file."""
+        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file.
+
+        Arrays with an entry per site, such as `alpha`, have this order.
+        """
         return tuple(self.sites)
 
     @cached_property
@@ -414,9 +422,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """Matrix of dominance factors, shape (N, N), Eq. (6).
+        """Matrix of the dominance factors at the start of the run, shape (N, N), Eq. (6).
 
-        The entry of row i and column j is the weight with which site i follows site j.
+        The entry of row i and column j is the weight with which site i follows site j. A site
+        without a factor for a peer does not follow it.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
@@ -426,8 +435,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def controls(self) -> tuple[ChosenLaw, ...]:
         """Control law of every site with its gains, in the order of the sites.
 
-        Some laws have gains that follow from the dominance factors at the start. A dominance
-        factor is the weight with which a site follows a peer. These gains are filled in.
+        Some laws have gains that follow from the dominance factors at the start, the weights
+        with which a site follows its peers. Here these gains are filled in.
         """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
@@ -478,7 +487,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def sha256(self) -> str:
         """SHA-256 hash of the scenario's TOML text in its canonical form (`text`).
 
-        Two scenarios have the same hash only if they describe the same experiment.
+        Two scenarios have the same hash only if they describe the same experiment. Sites
+        compare hashes before they join a session.
         """
         return hashlib.sha256(self.text.encode()).hexdigest()
 
@@ -526,13 +536,19 @@ class Scenario(Frozen, frozen=True, dict=True):
     def peers(self, site: str) -> tuple[str, ...]:
         """Returns the names of all other sites, in the order of the scenario.
 
+        Arrays with an entry per peer, such as the ages of samples, have this order. A peer is
+        included even if the site does not follow it.
+
         Args:
             site: Name of the site whose peers are returned.
         """
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns the links at the start and all their later states."""
+        """Returns the links at the start, and each state of a link after a planned change.
+
+        For example, a scenario is random if any of them is.
+        """
         later_links = [
             link for name in self.links for _, link in scheduled_links(self.timeline, name)
         ]
@@ -540,10 +556,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number of the experiment is random.
+        """True if any number of the experiment is random: another seed gives another run.
 
-        Then another seed gives another run. The numbers may be drawn when the scenario is
-        loaded, or during the run.
+        The numbers may be drawn when the scenario is loaded, or during the run.
         """
         return bool(self.drawn) or self.links_random
 
@@ -551,13 +566,14 @@ class Scenario(Frozen, frozen=True, dict=True):
     def links_random(self) -> bool:
         """True if a link draws its delays, losses or duplicates at random during the run.
 
-        A link may also do so only after a planned change.
+        This includes links that do so only after a planned change. Results then depend on the
+        seed, and one run is only an example.
         """
         return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
-        """True if at least one link has no artificial delay; the real network then decides.
+        """True if at least one link has no artificial delay, but that of the real network.
 
         Such a scenario can only run live.
         """
@@ -573,18 +589,19 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the first site with the role "slave".
+        """Name of the slave, the site whose arm works at the environment.
 
-        It is the name of the last site if no site has this role.
+        If several sites have the role "slave", it is the first of them. If none has, it is the
+        last site of the scenario.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Names of the sites whose arms are real robots.
+        """Names of the sites whose arms are real robots, with motion that is measured.
 
-        The motion of such an arm is measured. Empty if there are none.
+        A simulation cannot run these sites. Empty if there are none.
         """
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
@@ -592,7 +609,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def open_hands(self) -> tuple[str, ...]:
         """Names of the sites whose arms any member of the session may move.
 
-        A member is a process that takes part in the session.
+        A member is a process that takes part in the session, such as a page or a bridge. The
+        arm of a user's program is not open: that program alone moves it.
         """
         return tuple(
             name
@@ -622,6 +640,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def channel(self, site: str) -> LawChannel:
         """Returns the layout of the numbers that the control law of a site sends to its peers.
+
+        Most laws send nothing but the state of the arm, and have an empty layout. A law that
+        sends waves, for example, has a vector for them.
 
         Args:
             site: Name of the site.
@@ -751,7 +772,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> site_setup.RestGains:
-        """Returns the gains of the controller that brings a site's arm to rest."""
+        """Returns the gains of the controller that brings a site's arm to rest.
+
+        It acts, for example, when a peer is silent. The gains depend on the arm, on the limit
+        of its torque, on the tick rate and on the damping that the control law already has.
+        """
         spec = self.sites[site]
         arm = self.arms[site]
         gains = spec.control.linear_gains(arm.theta) or spec.control.gains(arm.theta)
@@ -767,7 +792,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
-        """Returns the link from a peer to a site in the form of the simulation kernel.
+        """Returns the link from a peer to a site as the record that the kernel reads.
 
         It includes the planned changes of the link.
 
@@ -804,7 +829,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the sites that a site follows, as an integer with bit n set for site n."""
+        """Returns the sites that a site follows, as an integer with bit n set for site n.
+
+        For example, 0b101 for the first and the third site. The kernel needs this compact
+        format.
+        """
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
@@ -845,7 +874,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
 
         Returns:
-            The changes in the form of the simulation kernel. Empty if none is planned.
+            The changes as records that the kernel reads. Empty if none is planned.
         """
         return [
             self.ramp(site, change.to, change.start_ns, change.ramp_s)
@@ -854,10 +883,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         ]
 
     def without_hands(self) -> "Scenario":
-        """Returns the same experiment without operators.
+        """Returns the same experiment without the persons or programs who move the arms.
 
-        Operators are the persons or programs who move the arms. Walls and other environments
-        remain.
+        Walls and other environments remain. Values that were drawn at random for operators are
+        left out of the list of drawn values.
         """
         sites = {
             name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()

@@ -75,7 +75,7 @@ _plain_sincos = getattr(sincos, "py_func", sincos)
 
 
 class UrdfPayload(NamedTuple):
-    """Body, such as a tool, that is fixed to the tip of an arm.
+    """Body that a scenario fixes to the tip of an arm, such as a tool that its URDF file lacks.
 
     Attributes:
         mass_kg: Mass, in kg.
@@ -184,7 +184,7 @@ class _Edge(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """True if the joint can move a link of an arm."""
+        """True if the joint can move a link of an arm. A fixed joint cannot."""
         return self.kind in _MOVING_KINDS
 
 

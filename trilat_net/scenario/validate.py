@@ -68,6 +68,8 @@ def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
 def write_simulated_options(scenario: Scenario) -> str:
     """Returns the options `--set` with which a command runs with simulated arms only.
 
+    Error messages suggest them when a scenario with real arms cannot be simulated.
+
     Args:
         scenario: Description of the experiment.
     """

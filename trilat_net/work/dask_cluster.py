@@ -146,6 +146,9 @@ def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
     """Returns the laws whose file this process does not have, or has with other contents.
 
+    A worker without the file of a user's law could not run the study, or would compute other
+    results.
+
     Args:
         laws: Name of each law, with the SHA-256 of its file.
     """
@@ -242,13 +245,19 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`."""
+        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`.
+
+        A function is executed again for each call, even if the arguments are the same.
+        """
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     @property
     def workers(self) -> int:
-        """Number of items that all workers together run at the same time."""
+        """Number of items that all workers together run at the same time, one per thread.
+
+        The number may change, because workers may join and leave.
+        """
         workers = self._client.scheduler_info()["workers"]
         return sum(worker["nthreads"] for worker in workers.values())
 

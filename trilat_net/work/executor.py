@@ -68,7 +68,7 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Ignores a report of progress. Callers without a progress display use this function."""
+    """Ignores a report of progress: a default for callers that have no progress display."""
 
 
 class _BatchResult(NamedTuple):
@@ -181,6 +181,8 @@ class _Feed(Generic[T]):
     def add_timing(self, runs: int, wall_s: float) -> None:
         """Updates the mean duration of an item, from which the size of later batches follows.
 
+        Short items are sent in large batches, because sending takes time as well.
+
         Args:
             runs: Number of finished items.
             wall_s: Duration of all of them together, in s.
@@ -227,7 +229,7 @@ class _Feed(Generic[T]):
         return batch
 
     def return_lost(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
-        """Puts the items of a batch whose worker died back into the queue.
+        """Puts the items of a batch whose worker died back into the queue, to run them again.
 
         Args:
             batch: Batch whose worker died.

@@ -34,12 +34,15 @@ from .executor import Progress, Together, WorkerPool
 
 
 def format_command(*arguments: str) -> str:
-    """Returns a command line of this program, with its arguments quoted for a shell."""
+    """Returns a command that a user can paste into a shell: "trilat sim 'my run.toml'".
+
+    Arguments with spaces or special characters are quoted. The word "trilat" is put first.
+    """
     return join_arguments(["trilat", *arguments])
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns the command line options that apply overrides of a scenario.
+    """Returns the command-line options --set that apply overrides of a scenario.
 
     Args:
         overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
@@ -153,12 +156,13 @@ class _JournalEntry(Protocol):
     def cell(self) -> Hashable:
         """Identifier of the part of the study to which the run belongs.
 
-        For example, the number of a grid point in a sweep over parameters.
+        For example, the number of a grid point in a sweep over parameters. The journal must
+        tell which runs of a cell are finished, so that an interrupted study can continue.
         """
 
     @property
     def seed(self) -> int:
-        """Seed of the random numbers of the run, which distinguishes the runs of a cell."""
+        """Seed of the run's random numbers. The runs of one cell differ by their seeds only."""
 
 
 P = TypeVar("P")

@@ -136,9 +136,10 @@ class SiteEnergy:
 
     @property
     def largest_age_s(self) -> float:
-        """The largest age of a state that the site received and used, in s.
+        """Largest age of the peers' states that the site used in a tick, in s.
 
-        It is 0 if the site never used a state of a peer.
+        The age of a state is the time since the peer sent it, thus the delay that the
+        controller sees. It is 0 if the site never used a state of a peer.
         """
         t_s = self.motion.records.t_s
         largest_s = []
@@ -152,8 +153,9 @@ class SiteEnergy:
     def begin_s(self) -> float:
         """Time of the first tick at which the energy V_i of the site can be computed, in s.
 
-        V_i depends on the motion of the other sites since they sent the states that are in use.
-        If this motion is not recorded at any tick, the time is infinite.
+        V_i depends on the motion of the other sites since they sent the states that are in use,
+        which the first records do not contain. If this motion is not known at any tick, the
+        time is infinite.
         """
         known = []
         for view in self.followed.values():
@@ -197,7 +199,12 @@ class SiteEnergy:
         return rule_error + self._estimate_coupled_error()
 
     def _estimate_coupled_error(self) -> float:
-        """Returns the energy of changes of r times changes of the torques, in J."""
+        """Returns an estimate of the energy that the trapezoid rule misjudges, in J.
+
+        Within a period, both the filtered error r and the torques change. The product of both
+        changes is not contained in the mean of the powers at its ends. The estimate is an upper
+        bound for the error of the balance.
+        """
         records = self.motion.records
         ends = self.motion.ends
         change_of_r = ends.r_right - ends.r_left
@@ -366,8 +373,8 @@ class EnergyBalance:
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
         """The total energy of the arms in the stability proof over time, shape (T,), in J.
 
-        It is the sum of the energies of the sites, the processes that run one arm each. Every
-        site is weighted with its entry of `beta`.
+        V = sum_i beta_i V_i, where V_i is the energy of site i, and beta_i its entry of `beta`.
+        The theorem says that V never rises, unless an operator supplies energy.
         """
         return _sum(self.parts)
 
@@ -376,7 +383,8 @@ class EnergyBalance:
         """The part of the change of V that no known energy explains, shape (T,), in J.
 
         It is V - V(0) + dissipation - work, summed over the judged periods, which are those
-        that rest on records alone. It includes the work of sampling.
+        that rest on records alone. It includes the work of sampling, and should otherwise be
+        close to 0. A large residual shows that the records contradict each other.
         """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
@@ -407,7 +415,10 @@ class EnergyBalance:
 
     @property
     def _work_from_outside(self) -> dict[str, Array]:
-        """Work of operators, environments and stops, by source."""
+        """Work of operators, environments and stops, by source, shape (T,) each, in J.
+
+        Other work, such as that of gravity, is internal to the arms.
+        """
         sources = {}
         for name in EXTERNAL_SOURCES:
             if name in self.work:
@@ -416,14 +427,19 @@ class EnergyBalance:
 
     @property
     def external_work(self) -> Array:
-        """Work of operators, environments and stops since the first tick, shape (T,), in J."""
+        """Work of operators, environments and stops on all arms since the first tick, in J.
+
+        The stability proof permits V to rise by this amount. The shape is (T,), with one entry
+        per tick.
+        """
         return _sum(self._work_from_outside)
 
     @property
     def external(self) -> dict[str, Array]:
-        """Work of those operators, environments and stops that did any work, by source, in J.
+        """Work of each external source that did any work, by its name, shape (T,), in J.
 
-        Each entry has the shape (T,).
+        The sources are the operators, the environments and the mechanical stops of joints. The
+        text of the certificate names them.
         """
         sources = self._work_from_outside
         return {name: work for name, work in sources.items() if work.any()}
@@ -433,7 +449,7 @@ class EnergyBalance:
         """The size of the energies in the balance, in J, with which its errors are compared.
 
         It is the largest magnitude that the total energy V, or the work of any source, reaches
-        during the run.
+        during the run. An error of 1 mJ is negligible for a scale of 100 J, but not for 1 mJ.
         """
         largest = []
         for energy in [self.V, *self.work.values()]:
@@ -500,7 +516,7 @@ def compute_energy_balance(
     all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
-        """Returns the energies of a kind over time, summed over the judged periods.
+        """Returns the energies of a kind over time, each accumulated over the judged periods.
 
         Args:
             kind: The kind, such as "dissipation" or "work".
@@ -724,6 +740,9 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
 
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above its smallest earlier value, at each time.
+
+    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. An energy that first falls and then
+    rises must not hide the rise behind the fall.
 
     Args:
         values: Values of the quantity over time, shape (T,).

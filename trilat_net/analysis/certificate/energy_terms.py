@@ -110,7 +110,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def theta(self) -> Array:
-        """The arm's true parameters, shape (P,)."""
+        """The arm's true parameters, which combine masses, inertias and lengths, shape (P,).
+
+        V measures how far the estimates are from them.
+        """
         return self.arm.theta
 
     @property
@@ -141,7 +144,11 @@ class SiteConstants(NamedTuple):
 
     @property
     def unknown_friction(self) -> Array:
-        """Fraction of each joint's friction that the law does not compensate, shape (n,)."""
+        """Fraction of each joint's friction that the law does not compensate, shape (n,).
+
+        It is 0 for a joint without friction. Uncompensated friction does work that the energy
+        balance must contain, and an adaptive law cannot learn it.
+        """
         joints = len(self.Kp)
         unit_speeds = np.ones((1, joints))
         friction_torque = self.arm.friction(unit_speeds)[0]
@@ -151,9 +158,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def adapts(self) -> Bools:
-        """Marks the dynamic parameters that the control law estimates, shape (P,).
+        """Marks the parameters of the arm that the law estimates while it runs, shape (P,).
 
-        The other parameters keep the value that the scenario gives them.
+        These are the parameters with a positive adaptation gain Gamma. The others keep the
+        value that the scenario gives them.
         """
         return self.Gamma > 0.0
 
@@ -313,6 +321,9 @@ class SiteMotion:
     def law_torque(self, rows: Ints) -> Array:
         """Returns the torque that the control law demands, before it is limited.
 
+        The torque is computed again from the records. A difference from the recorded torque
+        shows that the records are false, or that the torque was cut off.
+
         Args:
             rows: Rows of the records at which the law is evaluated, shape (K,).
 
@@ -368,9 +379,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records in which the arm comes to rest, or has just done so, shape (K,).
+        """Marks the records in which the site brings its arm to rest, or did so, shape (K,).
 
-        The recorded torque may then differ from the torque that the control law demands.
+        The site then adds a braking torque, for example because a peer is silent. The recorded
+        torque may therefore differ from the torque of the control law, and must not be compared
+        with it.
         """
         records = self.records
         if records.rests.size:
@@ -411,7 +424,9 @@ class SiteMotion:
     def limited(self) -> Bools:
         """Marks each recorded torque that is at a limit of the joint, shape (K, n).
 
-        The limit is the largest torque or the largest change of the torque per tick.
+        The limit is the largest torque, or the largest change of the torque per tick. At a
+        limit, the arm may have received less than the control law demanded, contrary to a
+        premise.
         """
         low, high = self.torque_bounds
         c = self.constants
@@ -516,12 +531,18 @@ class FunctionalParts(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """V_i, shape (K,), in J."""
+        """Energy V_i of the site in the stability proof: the sum of its parts, in J.
+
+        The shape is (K,), with one entry per record.
+        """
         return self.kinetic + self.parameter + self.position + self.delay
 
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
-    """Computes the energy of a site in the stability proof at each of its K records.
+    """Computes the energy V_i of a site in the stability proof at each of its K records.
+
+    The module's docstring has the equation. The parts are returned separately, because figures
+    and the certificate show them.
 
     Args:
         site: Motion of the site.
@@ -601,7 +622,11 @@ class Increment(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """The energy of each tick period, including its jump, shape (K - 1,), in J."""
+        """Change of the energy in each tick period, in J, as the sum of the three parts.
+
+        The parts are the contribution of the power at its start, that at its end, and the jump
+        there. K ticks bound K - 1 periods, so that the shape is (K - 1,).
+        """
         return self.left + self.right + self.jump
 
 
@@ -639,13 +664,17 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
 
 
 def _jump_alone(amount: Array) -> Increment:
-    """Returns amounts of energy that all belong to the jumps at the ends of periods."""
+    """Returns an energy that changes only by jumps, when a new sample comes into use.
+
+    Args:
+        amount: The jump at the end of each period, shape (K - 1,), in J.
+    """
     zero = np.zeros(len(amount))
     return Increment(zero, zero, amount)
 
 
 def _zero_increment(site: SiteMotion) -> Increment:
-    """Returns no energy in every period."""
+    """Returns an energy of zero in every period, for terms that a site does not have."""
     periods = len(site.records.known) - 1
     return _jump_alone(np.zeros(periods))
 

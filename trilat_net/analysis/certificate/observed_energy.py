@@ -53,9 +53,12 @@ NEGATIVE_ENERGY_MEANING = (
 
 
 class ObservedFinding(StrEnum):
-    """Result of the check that the energies which control laws declare stay above zero.
+    """Result of checking the energies that control laws declare, such as a tank's.
 
-    The value of each member is a phrase for the user.
+    A law that never returns more energy than it received keeps its declared energy above zero.
+    The result is BROKEN if the declared energy does not follow from the recorded torques and
+    velocities, and NOT_JUDGED if the records do not suffice. The value of each member is the
+    phrase for the user.
     """
 
     PASSIVE = "observed energy never below zero"
@@ -144,9 +147,10 @@ class ObservedEnergy(NamedTuple):
     curves: Sequence[_EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
-        """Returns this verdict on the declared energies as plain values, ready for JSON.
+        """Returns the verdict, its premises and the least energies as values for JSON.
 
-        The energies over time are left out.
+        The energies over time are left out, because they have a value per tick and serve for
+        figures.
         """
         content = self._asdict()
         del content["curves"]
@@ -177,7 +181,7 @@ class _SiteBooks(NamedTuple):
 
 
 def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that declare energies, by site.
+    """Returns the control laws that declare energies, such as the level of a tank, by site.
 
     Args:
         scenario: Scenario of the run.
@@ -199,7 +203,7 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
-    """Checks the energies that the control laws of a log declare.
+    """Checks the energies that the control laws of a log declare, against the recorded motion.
 
     Args:
         log: The log of the run.
@@ -296,7 +300,7 @@ def _read_law_records(
     law: Any,
     count: int,
 ) -> LawRecords:
-    """Returns the records of a site in the form that a law expects.
+    """Returns the records of a site as the object that a law reads to compute its energies.
 
     Args:
         log: The log of the run.
@@ -492,7 +496,11 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
 
 
 def _largest_residual_j(site_books: _SiteBooks) -> float:
-    """Returns the largest error in the books of a law, in J."""
+    """Returns the largest error over time in the energies that a law declares, in J.
+
+    The error is the difference between the energy that the law dissipated and the sum of its
+    other energies.
+    """
     return float(np.abs(site_books.residual).max())
 
 

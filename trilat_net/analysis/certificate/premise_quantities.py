@@ -18,7 +18,11 @@ from ..torque_sources import WallEnergy
 
 
 class FunctionalObstacle(Enum):
-    """Reason why the energy function V of the stability proof does not exist for an arm."""
+    """Reason why the energy function V of the stability proof does not exist for an arm.
+
+    Without V, the certificate judges the run by the other methods, for example by its final
+    motion.
+    """
 
     UNKNOWN_PARAMETERS = auto()
     """The parameters theta of the arm are unknown."""
@@ -29,7 +33,7 @@ class FunctionalObstacle(Enum):
 
 
 class MissingFunctional(NamedTuple):
-    """Sites whose arms have no energy function V, for the same reason.
+    """Group of sites whose arms have no energy function V, all for the same reason.
 
     Attributes:
         obstacle: The reason.
@@ -43,17 +47,21 @@ class MissingFunctional(NamedTuple):
 
 
 class LawQuantities(NamedTuple):
-    """Quantities of the premise that every site has an adaptive law, and V exists.
+    """Evidence for the premise that V exists, as each site has an adaptive law.
 
     Attributes:
-        missing: Sites without V, grouped by the reason.
+        missing: Sites without V, grouped by the reason. The premise holds if there are none.
     """
 
     missing: tuple[MissingFunctional, ...]
 
 
 class ParameterFault(Enum):
-    """Reason why an adaptive law cannot learn the parameters theta of its arm."""
+    """Reason why an adaptive law cannot learn the true parameters theta of its arm.
+
+    The proof assumes that constant parameters exist with which the law is exact. Each fault
+    makes this assumption false, and the premise names the sites concerned.
+    """
 
     OUTSIDE_BOX = auto()
     """Theta is outside the box in which the law keeps its estimates."""
@@ -64,17 +72,20 @@ class ParameterFault(Enum):
 
 
 class ParameterQuantities(NamedTuple):
-    """Quantities of the premise that the adaptive laws can learn the parameters of their arms.
+    """Evidence for the premise that the adaptive laws can learn the parameters of their arms.
 
     Attributes:
-        faults: Name of the site and reason, for each fault.
+        faults: Name of the site and reason, for each fault. The premise holds if there are
+            none.
     """
 
     faults: tuple[tuple[str, ParameterFault], ...]
 
 
 class GainQuantities(NamedTuple):
-    """Quantities of the premise that the gain Kd is the same everywhere, up to a factor.
+    """Evidence for the premise that the gain Kd is equal at all sites, up to a factor each.
+
+    The factors can be balanced by the weights of the sites in V. Other differences cannot.
 
     Attributes:
         Kd: Gain of each site per joint, in N m s/rad. In task space per coordinate, in N s/m.
@@ -88,7 +99,10 @@ class GainQuantities(NamedTuple):
 
 
 class WallQuantities(NamedTuple):
-    """Quantities of the premise that simulated walls generate no energy.
+    """Evidence for the premise that simulated walls generate no energy.
+
+    A wall whose force is computed once per tick generates energy. The damping of the arm may
+    remove more than that.
 
     Attributes:
         walls: The walls that were touched, with their energies and dampings.
@@ -98,14 +112,20 @@ class WallQuantities(NamedTuple):
 
     @property
     def active(self) -> tuple[WallEnergy, ...]:
-        """Walls whose arm dissipates less energy than they generate."""
+        """Walls that generate at least as much energy as the touching arm's damping removes.
+
+        A simulated wall computes its force once per tick and thereby generates energy. If the
+        arm does not remove it, the contact may vibrate. Empty if there is no such wall.
+        """
         return tuple(
             wall for wall in self.walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m
         )
 
 
 class DominanceQuantities(NamedTuple):
-    """Quantities of the premise on the dominance factors.
+    """Evidence for the premise that the dominance factors are constant and give weights for V.
+
+    A dominance factor is the weight with which a site follows a peer.
 
     Attributes:
         changing: Sites whose dominance factors change.
@@ -124,7 +144,9 @@ class DominanceQuantities(NamedTuple):
 
 
 class AgeRange(NamedTuple):
-    """Smallest and largest age of the samples that a site uses of a peer.
+    """Range of the ages of the samples that one site uses of another one.
+
+    The age is the time since the sample was sent: the delay that the control law sees.
 
     Attributes:
         peer: Site that sends the samples.
@@ -140,10 +162,10 @@ class AgeRange(NamedTuple):
 
 
 class DelayQuantities(NamedTuple):
-    """Quantities of the premise that the delay of every link is constant.
+    """Evidence for the premise that the delay of every link is constant.
 
     Attributes:
-        varying: Ages on the links whose delay varies.
+        varying: Ages on the links whose delay varies. The premise holds if there are none.
         constant_s: Delay of each of the other links that delivered a sample, in s.
     """
 
@@ -152,7 +174,7 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """The time during which a site did not follow its peers.
+    """Interval in which a site did not follow its peers, contrary to a premise.
 
     Attributes:
         site: Name of the site.
@@ -166,7 +188,7 @@ class Interruption(NamedTuple):
 
 
 class FollowingQuantities(NamedTuple):
-    """Quantities of the premise that every site follows its peers.
+    """Evidence for the premise that every site follows its peers during the whole run.
 
     Attributes:
         interruptions: Times at which sites held, braked, returned or had stopped.
@@ -181,12 +203,12 @@ class FollowingQuantities(NamedTuple):
 
 
 class CutTorque(NamedTuple):
-    """A site whose torque was cut off at the limit of its actuators.
+    """A site whose actuators could not deliver the torque that its control law demanded.
 
     Attributes:
         site: Name of the site.
-        joints: Names of the joints. Empty if the joints have no names.
-        ticks: Number of ticks.
+        joints: Names of the joints concerned. Empty if the joints have no names.
+        ticks: Number of ticks in which a torque was cut off at its limit.
     """
 
     site: str
@@ -195,10 +217,13 @@ class CutTorque(NamedTuple):
 
 
 class TorqueQuantities(NamedTuple):
-    """Quantities of the premise that no torque was cut off.
+    """Evidence for the premise that every arm received the whole torque of its control law.
+
+    An actuator cuts off a torque above its limit. The arm then receives another torque than the
+    proof assumes.
 
     Attributes:
-        cut: Sites whose torque was cut off.
+        cut: Sites whose torque was cut off. The premise holds if there are none.
     """
 
     cut: tuple[CutTorque, ...]
@@ -209,7 +234,7 @@ class TouchedStop(NamedTuple):
 
     Attributes:
         site: Name of the site.
-        joints: Names of the joints. Empty if the joints have no names.
+        joints: Names of the joints that touched. Empty if the joints have no names.
         from_s: Time of the first contact, in s.
     """
 
@@ -219,17 +244,19 @@ class TouchedStop(NamedTuple):
 
 
 class StopQuantities(NamedTuple):
-    """Quantities of the premise that no joint touches its stops.
+    """Evidence for the premise that no joint touched the mechanical stops that limit its range.
 
     Attributes:
-        touched: Sites whose arms touched their stops.
+        touched: Sites whose arms touched their stops. The premise holds if there are none.
     """
 
     touched: tuple[TouchedStop, ...]
 
 
 class AxisQuantities(NamedTuple):
-    """Quantities of the premise that followed sites follow along the same axes.
+    """Evidence for the premise that followed sites follow along the same axes.
+
+    It concerns sites in task space, whose end effectors may leave some axes free.
 
     Attributes:
         faults: Pairs (follower, followed site) with an axis that only the follower follows.
@@ -239,11 +266,15 @@ class AxisQuantities(NamedTuple):
 
 
 class SingularPoseQuantities(NamedTuple):
-    """Quantities of the premise that no arm came near a singular pose.
+    """Evidence for the premise that no arm came near a singular pose.
+
+    In such a pose the end effector cannot move in every direction, however fast the joints
+    turn.
 
     Attributes:
         near_s: Time from which the arm of a site was near a singular pose, in s, by site.
-        least_values: Least singular value of the Jacobian of each site, in m/rad.
+        least_values: Least singular value of the Jacobian of each site, in m/rad. Near a
+            singular pose it is close to 0.
     """
 
     near_s: Mapping[str, float]
@@ -273,7 +304,9 @@ class Supply(NamedTuple):
 
 
 class OperatorQuantities(NamedTuple):
-    """Quantities of the premise that operators and environments are passive.
+    """Evidence for the premise that operators and environments are passive.
+
+    A passive operator never returns more energy than it received. V may otherwise rise.
 
     Attributes:
         unmeasured: Sites with external arms, if no record tells who pushes them.
@@ -288,7 +321,9 @@ class OperatorQuantities(NamedTuple):
 
 
 class RecordQuantities(NamedTuple):
-    """Quantities of the premise that no records are missing.
+    """Evidence for the premise that no records are missing.
+
+    V cannot be computed where records are missing.
 
     Attributes:
         unjudged_s: Spans (start, end) in which records are missing although all sites were
@@ -301,7 +336,7 @@ class RecordQuantities(NamedTuple):
 
 
 class AbsentSpan(NamedTuple):
-    """A span of time during which a site was absent from the session.
+    """A span of time in which a site was absent from the session and executed no ticks.
 
     Attributes:
         site: Name of the site.
@@ -315,7 +350,10 @@ class AbsentSpan(NamedTuple):
 
 
 class PresentStretch(NamedTuple):
-    """A stretch of time during which all sites were present.
+    """A stretch of time between two absences, in which all sites were present.
+
+    The stability theorem can apply to a stretch only from the time at which all sites follow
+    again.
 
     Attributes:
         from_s: Start, in s.
@@ -332,7 +370,9 @@ class PresentStretch(NamedTuple):
 
 
 class PresenceQuantities(NamedTuple):
-    """Quantities of the premise that all sites are present during the whole run.
+    """Evidence for the premise that all sites are present during the whole run.
+
+    A site may leave a session and return. The theorem then applies to each stretch between.
 
     Attributes:
         absent: Spans of time during which sites were absent.
@@ -344,12 +384,14 @@ class PresenceQuantities(NamedTuple):
 
 
 class BooksQuantities(NamedTuple):
-    """Quantities of the premise that the energies that control laws declare add up.
+    """Evidence for the premise that the energies that control laws declare add up.
+
+    The declared energies must follow from the recorded torques and velocities.
 
     Attributes:
         site: Site whose law has the largest error.
         residual_j: This error, in J.
-        scale_j: Largest energy that occurs, in J.
+        scale_j: Largest energy that occurs, in J, with which the error is compared.
     """
 
     site: str
@@ -358,7 +400,10 @@ class BooksQuantities(NamedTuple):
 
 
 class BookedTorqueQuantities(NamedTuple):
-    """Quantities of the premise that control laws count the torque that the arms received.
+    """Evidence for the premise that control laws count the torque that the arms received.
+
+    A law that counts the torque it demanded, although the actuator delivered less, has wrong
+    energies.
 
     Attributes:
         cut: Sites whose torque was cut off at the limit of their actuators.
@@ -370,11 +415,14 @@ class BookedTorqueQuantities(NamedTuple):
 
 
 class SamplingQuantities(NamedTuple):
-    """Quantities of the premise that arms receive little energy that their laws do not count.
+    """Evidence for the premise that arms receive little energy that their laws do not count.
+
+    A torque is held over a tick while the arm moves on. The law, which sees the arm at ticks
+    only, does not count the energy that arises between.
 
     Attributes:
-        site: Site that received most of such energy.
-        leak_j: This energy, in J. It arises between ticks.
+        site: Site that received most of this energy.
+        leak_j: This energy, in J.
     """
 
     site: str

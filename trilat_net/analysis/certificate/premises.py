@@ -128,11 +128,18 @@ class Premise(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The evidence, as a sentence."""
+        """What the log shows about the premise, as a sentence for people.
+
+        `premise_text` has a function for each class of quantities that composes this sentence.
+        """
         return DESCRIBERS[type(self.quantities)](self.quantities)
 
     def to_json(self) -> JsonObject:
-        """Returns the premise as plain values, with the keys of `trilat certify --json`."""
+        """Returns the premise as a row of `trilat certify --json`.
+
+        For example {"name": "torque", "holds": True, "text": ...}, where the text states the
+        evidence.
+        """
         return {"name": self.name, "holds": self.holds, "text": self.text}
 
 
@@ -169,7 +176,9 @@ def _find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function of the stability proof does not exist.
+    """Explains for which arms the energy function V of the stability proof does not exist.
+
+    A certificate then judges the run without V.
 
     Args:
         scenario: The description of the experiment.
@@ -778,9 +787,10 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Reasons why the records do not suffice to judge the run, a sentence for each.
+        """Sentences that say why the records do not suffice to judge the run.
 
-        Empty if they suffice.
+        Examples are a log that was changed after the run, or too many missing records. A run
+        with such a reason is not called stable. Empty if the records suffice.
         """
         least = self.min_coverage
         reasons = []
@@ -798,13 +808,18 @@ class Evidence(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for the user: how many records exist, and whether the log is unchanged."""
+        """A sentence for the user: how many records exist, and whether the log is unchanged.
+
+        The certificate prints this sentence for every run, also if the records suffice.
+        """
         return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
 
     def to_json(self) -> dict[str, Any]:
-        """Returns how complete and how authentic the records are, as plain values.
+        """Returns the extent and authenticity of the records as plain values.
 
-        The keys are those of the JSON output of `trilat certify`.
+        The keys are those of `trilat certify --json`. For example, "coverage" is the smallest
+        share of a site's ticks that have a record, from 0 to 1, and "integrity" states whether
+        the log is unchanged.
         """
         return {
             "coverage": self.coverage.share,
@@ -818,6 +833,8 @@ class Evidence(NamedTuple):
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     """Collects how complete the records of a run are, and whether its log is unchanged.
+
+    A run of which too little is known is not called stable, see `Evidence.reasons`.
 
     Args:
         run: Facts of the run, computed by `gather_facts`.

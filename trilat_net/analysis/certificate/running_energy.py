@@ -122,7 +122,7 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores a record in the window.
+        """Stores a record at the row of its tick. Records may arrive in any order.
 
         Args:
             record: The record.
@@ -164,7 +164,7 @@ class RecordWindow:
         return bool(find_unlimited_rows(self._limits, qd_des))
 
     def _shift_to(self, first: int) -> None:
-        """Drops the records before tick `first`, and moves the others to the front."""
+        """Makes room for newer records: drops those before tick `first`, and moves the rest."""
         remaining = max(0, self.newest + 1 - first)
         dropped = first - self.first
         for rows in (self._floats, self._used, self._known, self._follows, self._rests):
@@ -174,7 +174,7 @@ class RecordWindow:
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """Returns True if the stored records contain the record of a tick.
+        """Returns True if the record of a tick has arrived, and is still in the window.
 
         Args:
             tick: Number of the tick, a period of the control loop.
@@ -184,7 +184,9 @@ class RecordWindow:
         return bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of a span of ticks. Missing records are interpolated.
+        """Returns the records of a span of ticks as arrays, as the energy terms need them.
+
+        Missing records are interpolated, and marked.
 
         Args:
             first: First tick.
@@ -237,13 +239,15 @@ class RecordWindow:
 
 
 class EnergyCourse(NamedTuple):
-    """The energy function V of the stability proof over a span of time.
+    """The energy function V of the stability proof, over a span of time of a running session.
+
+    A live display shows V and the energy that was supplied: V may rise only by the latter.
 
     Attributes:
         t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.
         V: The energy function, shape (T,), in J.
         supplied: Work of operators and environments since the first computed time, shape (T,),
-            in J. V may rise only by this work.
+            in J.
     """
 
     t_s: Array

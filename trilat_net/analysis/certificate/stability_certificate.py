@@ -86,7 +86,9 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 class StabilityFinding(StrEnum):
     """What the energy function V of the stability proof shows about a run.
 
-    The value of each member is the text for people.
+    COVERED means that all premises of the theorem hold, so that it proves the run stable.
+    BROKEN means that the records contradict each other, and ROSE that V rose without a supply
+    of energy. The value of each member is the text for people.
     """
 
     COVERED = "covered by the theorem"
@@ -177,7 +179,10 @@ class Certificate(Result):
 
     @property
     def has_functional(self) -> bool:
-        """True if the energy function V of the stability proof exists for the laws."""
+        """True if the energy function V of the stability proof exists for this run's laws.
+
+        Texts and pages leave out V and its terms otherwise.
+        """
         laws = [premise.holds for premise in self.premises if premise.name == "law"]
         return laws != [False]
 
@@ -226,7 +231,11 @@ class Certificate(Result):
 
     @property
     def _doubts(self) -> tuple[str, ...]:
-        """Sentences on V, declared energies and the log that contradict a stable run."""
+        """Sentences on findings that contradict a stable run.
+
+        They are about V that rose, declared energies that are wrong or negative, and the log.
+        Empty if there are none.
+        """
         doubts = []
         if self.verdict.finding is StabilityFinding.BROKEN:
             doubts.append(self.verdict.text)
@@ -238,7 +247,12 @@ class Certificate(Result):
 
     @cached_property
     def decision(self) -> StabilityDecision:
-        """The decision whether the run is stable, with its basis and what speaks against it."""
+        """The decision whether the run is stable, what it rests on, and the reasons against it.
+
+        It combines the motion at the end, the repetitions with small pushes, the characteristic
+        roots, the proofs and the doubts, by the rules of `stability_decision`. It is computed
+        at first use.
+        """
         findings = RunFindings(
             end=self.end,
             twins=self.twins,
@@ -254,22 +268,33 @@ class Certificate(Result):
         """Sentences on everything that prevents a stable judgement or refutes it.
 
         They concern the end of the run, V, the roots at the end pose, the energies that control
-        laws declare, and the completeness of the log.
+        laws declare, and the completeness of the log. Empty for a stable run.
         """
         return self.decision.reasons
 
     @property
     def stability(self) -> Stability:
-        """The stability judgement of the run, as a whole, see `stability_decision`."""
+        """The judgement of the run as a whole: stable, settled, not stable, or open.
+
+        `stability_decision` explains how the findings of the certificate lead to this
+        judgement.
+        """
         return self.decision.stability
 
     @property
     def passed(self) -> bool:
-        """True if the run is stable. This decides the exit code of `trilat certify`."""
+        """True if the run is judged stable, in the strict sense.
+
+        A run that merely settled has not passed. `accepts` is less strict.
+        """
         return self.accepts(())
 
     def headline(self) -> str:
-        """Returns one line for people: the judgement, and how the run ended."""
+        """Returns the judgement and its basis in one line for people.
+
+        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". If the arms
+        exceeded their limits, the line says which joint did so, and when.
+        """
         if self.end.behaviour is EndBehaviour.DIVERGED:
             return f"{self.stability}: {self.end.text}"
         phrase = self.end.phrase
@@ -284,7 +309,11 @@ class Certificate(Result):
         return f"{text}; rests on: {rests_on}" if rests_on else text
 
     def to_dict(self) -> JsonObject:
-        """Returns the certificate as plain values, with the keys of `trilat certify --json`."""
+        """Returns the certificate as plain values, with the keys of `trilat certify --json`.
+
+        docs/reference/json.md explains the most important keys. The entry "functional" is None
+        if V cannot be computed.
+        """
         verdict = self.verdict
         end = self.end
         balance = self.balance
@@ -319,9 +348,9 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the conditions of the stability theorem as a table, with a row for each.
+        """Returns the premises of the stability theorem as a table, with a row for each.
 
-        The values are plain, ready for JSON.
+        A row has the keys "name", "holds" and "text", from which `to_frame` makes a data frame.
         """
         return [premise.to_json() for premise in self.premises]
 
@@ -451,7 +480,10 @@ def _judge_site_balances(
 
 
 def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerdict | None:
-    """Returns a verdict if recorded torques differ from the control law, Eq. (13)."""
+    """Returns the verdict BROKEN if recorded torques differ from the control law, Eq. (13).
+
+    The records are then false, so that nothing can be concluded from them. None if all agree.
+    """
     for site, energy in run.energies.items():
         records = energy.motion.records
         error_nm = energy_terms.measure_torque_error(energy.motion)

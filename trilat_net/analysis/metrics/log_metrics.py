@@ -101,6 +101,8 @@ class LogMetrics(Result):
     def label(self, number: int) -> str:
         """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
 
+        The name of a joint is added to its number if all arms name their joints alike.
+
         Args:
             number: Number of the joint or axis, from 1.
         """
@@ -125,7 +127,10 @@ class LogMetrics(Result):
         return joint_unit
 
     def headline(self) -> str:
-        """Returns a line for the user: the log, its sites, and the number of known values."""
+        """Returns one line with the log, the number of known values, and the sites.
+
+        For example "run.mcap: 84 numbers of paper, m1, m2, s".
+        """
         known = 0
         for _, metric in self._list_values():
             known += metric.value is not None
@@ -134,7 +139,11 @@ class LogMetrics(Result):
         return f"{self.log}: {numbers} of {self.scenario}, {sites}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the metrics as plain values, with the keys of `trilat metrics --json`."""
+        """Returns the metrics as plain values, with the keys of `trilat metrics --json`.
+
+        Each subject has its own dictionary: `["sites"]["m1"]` has the metrics of site m1 by
+        key. A value that is not known is None, and the entry "unknown" has the reason.
+        """
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
             "log": self.log,
@@ -184,9 +193,10 @@ class LogMetrics(Result):
         return reasons
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the metrics as a table of plain values.
+        """Returns a table with a row for each quantity and each subject that has the quantity.
 
-        There is a row for each quantity and each subject (run, site, link or wall) that has it.
+        A subject is the run, a site, a link or a wall. A row has the keys "group", "key",
+        "name", "of" (the subject), "unit", "value", and "why", the reason if the value is None.
         """
         rows: list[dict[str, Any]] = []
         for description, metric in self._list_values():
@@ -347,7 +357,7 @@ def _measure_subjects(view: RunView, wanted: Iterable[Measure]) -> dict[str, _Su
 
 
 def find_quantity(key: str) -> Quantity:
-    """Returns the quantity with a given key.
+    """Returns the definition of the quantity with a key such as "rms_error_rad".
 
     Raises:
         KeyError: No quantity has this key. The message names the most similar key.
@@ -364,6 +374,9 @@ def find_quantity(key: str) -> Quantity:
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
 def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
     """Computes only some quantities of a whole run, which is faster than all of them.
+
+    Other commands need a few numbers of many runs, for example to compare the points of a
+    sweep.
 
     Args:
         log: The log of the run.
@@ -444,7 +457,11 @@ def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> _Jso
 
 
 def _name_axis(metrics: LogMetrics, entry: _JsonEntry) -> _JsonEntry:
-    """Returns an entry of a joint, renamed to that of an axis, with the units of this axis."""
+    """Converts the entry of a joint to that of an axis, for arms that follow end effectors.
+
+    The key "joint" becomes "axis". Keys that end in a unit of torque or angle get the unit
+    along the axis, for example "force_nm" becomes "force_n".
+    """
     number = entry.pop("joint")
     renamed = {"axis": metrics.label(number)}
     for key, value in entry.items():
@@ -472,7 +489,7 @@ def _response_to_json(response: FrequencyResponse, unit: str) -> _JsonEntry:
 
 
 def _value_and_reason(key: str, value: Metric) -> _JsonEntry:
-    """Returns the number of a metric under a key, and the reason if the number is missing."""
+    """Returns a metric as two JSON keys: its number, and "why", the reason if it is missing."""
     return {key: value.value, "why": value.why or None}
 
 

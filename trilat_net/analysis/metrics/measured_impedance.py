@@ -277,7 +277,10 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the ratio: "N m s/rad" for an impedance, empty for a ratio of torques."""
+        """Unit of the ratio at a joint: "N m s/rad" for an impedance (torque per velocity).
+
+        Empty for a reflection, which is a ratio of two torques.
+        """
         return "" if self.kind == "reflection" else "N m s/rad"
 
 

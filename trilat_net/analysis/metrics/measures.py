@@ -46,7 +46,9 @@ _NOT_FINITE = "the number is not finite"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Wraps a number in a metric, which also says why a number is missing.
+    """Wraps a number in a metric. A missing number, or one that is not finite, gets a reason.
+
+    For example, metric(nan, "no contact") has the value None and the reason "no contact".
 
     Args:
         value: The number. None if there is none.
@@ -65,6 +67,8 @@ def unavailable(
     applies: bool = True,
 ) -> MetricValues:
     """Returns metrics without values for all quantities of a group, with a common reason.
+
+    A function that measures a group returns them if, for example, a site has no records.
 
     Args:
         group: Group of the quantities.
@@ -130,7 +134,9 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square of the column for which it is largest.
+    """Returns the root mean square over time of the column for which it is largest.
+
+    With a column per joint, this is the RMS value of the worst joint.
 
     Args:
         values: Values of n quantities over time, shape (K, n).
@@ -147,7 +153,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of some numbers.
+    """Returns the largest absolute value of some numbers, for metrics such as the peak torque.
 
     Args:
         values: The numbers, of any shape.
@@ -285,11 +291,18 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
 
 
 def list_measures() -> list[Measure]:
-    """Returns all functions that measure quantities, in the order in which they are shown."""
+    """Returns all registered functions that measure quantities, ordered by group.
+
+    The groups have the order in which they are shown to the user. Groups that are not in this
+    order, such as those of a new file, are last.
+    """
     rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
     return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
 
 
 def quantities() -> list[Quantity]:
-    """Returns the definitions of all quantities, in the order in which they are shown."""
+    """Returns the definitions of all quantities that any function of this folder measures.
+
+    Tables and docs/reference/metrics.md list them in this order.
+    """
     return [quantity for measure in list_measures() for quantity in measure.quantities]

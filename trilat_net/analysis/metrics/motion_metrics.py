@@ -422,7 +422,10 @@ class ParameterEstimates(NamedTuple):
     base: _BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
-        """Returns the parameter estimates of the arm as plain values, ready for JSON."""
+        """Returns the parameter estimates of the arm as plain values, ready for JSON.
+
+        The key "base" is left out if these values do not exist.
+        """
         content = self._asdict()
         del content["base"]
         if self.base is not None:
@@ -474,6 +477,8 @@ def _read_parameter_estimates(
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
     """Reads the parameter estimates of all sites at the start and at the end of a run.
+
+    They show what the adaptive laws learnt about their arms.
 
     Args:
         view: The run.

@@ -39,7 +39,10 @@ _NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work in each tick period of a torque that is held during the period.
+    """Returns the work of a torque that is constant within each tick period, in J.
+
+    The work in period k is exactly tau_k' (q_{k+1} - q_k), whatever the motion within the
+    period.
 
     Args:
         torque: Torque in every period, shape (K - 1, n) or longer, in N m.

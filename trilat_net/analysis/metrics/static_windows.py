@@ -200,6 +200,9 @@ def _average_window(
 class StiffnessEstimate(NamedTuple):
     """Stiffness that an operator met at a joint, between two successive static windows.
 
+    All arms rest in a static window. The stiffness is the change of torque over the change of
+    angle, for example of an arm that leans against a wall.
+
     Attributes:
         from_s: End of the first window, in s.
         to_s: End of the second window, in s.
@@ -310,9 +313,10 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Relative difference between the felt torque and the expected torque, from 0.
+        """Deviation of the felt torque from the expected torque, relative to the latter.
 
-        None if the expected torque is unknown or zero.
+        For example, 0.1 means that the felt torque is 10 % larger or smaller. None if the
+        expected torque is unknown or zero.
         """
         expected = self.expected_nm.value
         if expected is None or expected == 0.0:
@@ -375,6 +379,8 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 def count_static_windows(view: RunView) -> Metric:
     """Counts the times of a run in which all arms rest under constant torques.
+
+    Without such times, stiffness and force sharing cannot be measured.
 
     Args:
         view: The recorded run.

@@ -90,7 +90,12 @@ _BLAS_SYMBOLS = (
 
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
-    """Limits NumPy's linear algebra to one thread while the context is active."""
+    """Limits NumPy's linear algebra (BLAS) to one thread while the context is active.
+
+    For the small matrices of a loop, several threads cost more time than they save. The number
+    of threads is restored at the end, also after an exception. If the BLAS library has no
+    functions for this, the context has no effect.
+    """
     functions = _find_blas_functions()
     if functions is None:
         yield
@@ -158,7 +163,9 @@ class Pencil(NamedTuple):
         return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Evaluates the characteristic matrix Delta(s) and its derivative.
+        """Evaluates the characteristic matrix Delta(s) of the loop and its derivative.
+
+        Newton's method needs both to refine a root, at which Delta(s) is singular.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -217,7 +224,8 @@ class Pencil(NamedTuple):
     def delayed_states(self) -> NDArray[np.intp]:
         """Indices of the states whose delayed values act on the loop.
 
-        An arm, for example, follows the angles that another arm had some time ago.
+        An arm, for example, follows the angles that another arm had some time ago. Few states
+        do so, and only these are discretised over the delay, which keeps the matrices small.
         """
         effects = np.abs(self.Ad).sum(axis=(0, 1))
         return np.flatnonzero(effects)
@@ -275,12 +283,15 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 
 
 class CharacteristicRoot(NamedTuple):
-    """A characteristic root, or a pair of conjugate roots.
+    """A characteristic root s, which stands for the motion exp(s t) of a mode.
+
+    A complex root comes with its conjugate, which is not listed.
 
     Attributes:
-        s: The root with a non-negative imaginary part, in 1/s.
+        s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
+            rate.
         multiplicity: Number of modes that share the root.
-        states: Names of the states that participate most, the largest first.
+        states: Names of the states that participate most, the largest first, such as "m1.q2".
     """
 
     s: complex
@@ -289,7 +300,11 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio of the mode, -re(s) / abs(s). It is negative if the mode grows."""
+        """Damping ratio of the mode, -re(s) / abs(s), from -1 to 1.
+
+        It is 1 for a decay without oscillation, 0 for a lasting oscillation, and negative if
+        the mode grows.
+        """
         return -self.s.real / abs(self.s)
 
     @property
@@ -369,7 +384,12 @@ class Spectrum(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The stability of the loop: "stable", "unstable" or "at the edge"."""
+        """The stability by the rightmost root: "stable", "unstable" or "at the edge".
+
+        A root closer to the imaginary axis than `STABILITY_EDGE_PER_S`, or than twice its
+        standard deviation for random delays, is at the edge. So is a loop with a zero root
+        whose motion drifts.
+        """
         rightmost_per_s = -math.inf
         if self.roots:
             rightmost_per_s = self.roots[0].s.real
@@ -596,7 +616,7 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Computes the rightmost roots of a continuous loop.
+    """Computes the rightmost roots of a continuous loop, which decide its stability.
 
     Args:
         loop: The loop.
@@ -728,13 +748,24 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
 
 
 def chebyshev_nodes(order: int) -> Array:
-    """Returns the extremal nodes cos(pi k / order) from 1 to -1, shape (order + 1,)."""
+    """Returns the points of [-1, 1] at which the discretisation evaluates delayed states.
+
+    These are the extremal nodes cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
+
+    Args:
+        order: Degree of the polynomial through the points.
+
+    Returns:
+        The nodes, shape (order + 1,).
+    """
     angles = np.pi * np.arange(order + 1) / order
     return np.cos(angles)
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
     """Returns the matrix that interpolates values at the Chebyshev nodes at other points.
+
+    Its product with the values at the nodes is the value of the polynomial at the points.
 
     Args:
         order: Degree of the polynomial.

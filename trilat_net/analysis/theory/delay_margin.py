@@ -148,7 +148,7 @@ class DelayMargin(NamedTuple):
 
 
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a loop with the same delay on all of its links.
+    """Returns a loop with the same delay on all of its links, for example to check a margin.
 
     Args:
         loop: The loop.
@@ -323,7 +323,12 @@ class _FrequencySweep:
         self._modes: characteristic_roots.Complex = modes.astype(np.complex128)
 
     def build_grid(self) -> Array:
-        """Returns the frequencies to evaluate, in rad/s, denser near the loop's modes."""
+        """Returns the frequencies to evaluate, ascending, in rad/s.
+
+        They are evenly spaced on a logarithmic scale. Near the frequency of each oscillating
+        mode there are 13 more, within three times the decay rate of the mode, because sharp
+        resonances would fall between the others.
+        """
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)
         oscillates = np.abs(self._modes.imag) > 0.0

@@ -381,6 +381,8 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
 def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
     """Returns an equilibrium with remarks on effects that its linear loop misses.
 
+    Examples are torques at their limits and walls that are just touched.
+
     Args:
         conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.

@@ -54,6 +54,8 @@ class FrequencyBand(NamedTuple):
 class Minima(NamedTuple):
     """A curve over frequency, sampled so finely that its minima are resolved.
 
+    An example is the least eigenvalue of a frequency response, whose negative bands matter.
+
     Attributes:
         w_rad_s: Frequencies, shape (F,), in rad/s.
         values: Values of the curve, shape (F,).
@@ -66,12 +68,16 @@ class Minima(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least value of the curve."""
+        """The least value of the curve over all frequencies.
+
+        For an eigenvalue that must be positive, it is the margin, or a violation if it is
+        negative.
+        """
         return float(self.values.min())
 
     @property
     def least_hz(self) -> float:
-        """The frequency at which the curve has its least value, in Hz."""
+        """Frequency of the deepest minimum of the curve, in Hz, for texts."""
         least_index = self.values.argmin()
         w_rad_s = self.w_rad_s[least_index]
         return float(w_rad_s / (2.0 * np.pi))

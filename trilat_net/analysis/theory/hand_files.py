@@ -14,7 +14,10 @@ _KEYS = ("mass_kg", "damping_n_s_m", "stiffness_n_m")
 
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
-    """Reads the mass, damping and stiffness of hands from files.
+    """Reads the mass, damping and stiffness of hands that were measured before.
+
+    The analysis of ports uses them to check stability against these hands instead of all
+    passive operators.
 
     Args:
         files: Paths of JSON files that `trilat identify hand --json` wrote.

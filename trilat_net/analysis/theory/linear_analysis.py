@@ -115,12 +115,19 @@ class LinearAnalysis(Result):
 
     @property
     def verdict(self) -> str:
-        """Stability of small motions: "stable", "unstable" or "at the edge"."""
+        """Whether small motions die away: "stable", "unstable" or "at the edge".
+
+        The roots in `decisive` determine the verdict.
+        """
         return self.decisive.verdict
 
     @property
     def is_far_from_rest(self) -> bool:
-        """True if the run ends so far from the equilibrium that the verdict is not about it."""
+        """True if the run ends too far from the analysed equilibrium to be judged by it.
+
+        The limit is `NEAR_REST_RAD`. False for a scenario without a run, which has no final
+        pose.
+        """
         return self.distance_rad is not None and self.distance_rad > NEAR_REST_RAD
 
     @property
@@ -155,11 +162,17 @@ class LinearAnalysis(Result):
         return (*notes, *describe_law_conditions(self.scenario))
 
     def headline(self) -> str:
-        """Returns the verdict and the delay margin in one line."""
+        """Returns the scenario, the verdict and the delay margin in one line.
+
+        The delay margin is the delay of all links up to which the loop stays stable.
+        """
         return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the analysis as plain values, with the keys of `trilat linear --json`."""
+        """Returns the analysis as plain values, with the keys of `trilat linear --json`.
+
+        Parts that were not requested, or that do not exist for this loop, are None or empty.
+        """
         sampled = None
         if self.sampled is not None:
             sampled = _spectrum_to_json(self.sampled)

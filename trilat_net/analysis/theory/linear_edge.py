@@ -68,6 +68,8 @@ def find_rightmost_root(
 ) -> CharacteristicRoot | None:
     """Returns the rightmost characteristic root of the loop about an equilibrium.
 
+    Its real part is the growth rate of small motions: the loop is stable if it is negative.
+
     Args:
         conditions: The numbers of the loop.
         rest: The equilibrium.
@@ -147,6 +149,9 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 class LinearEdge(NamedTuple):
     """A value of a scenario's key at which a loop becomes stable or unstable.
 
+    At this value a characteristic root crosses the imaginary axis, and small motions oscillate
+    with the frequency of the root.
+
     Attributes:
         key: Key of the scenario, such as "control.d".
         value: Value of the key at the edge, in the unit of the key.
@@ -162,6 +167,8 @@ class LinearEdge(NamedTuple):
 
 class EdgeScan(NamedTuple):
     """The values of a key, within a range, at which a loop becomes stable or unstable.
+
+    A loop with no edge in the range is stable in the whole range, or unstable.
 
     Attributes:
         key: Key of the scenario, such as "control.d".
@@ -259,7 +266,10 @@ class _GrowthPoint(NamedTuple):
 
     @property
     def is_unstable(self) -> bool:
-        """True if the rightmost root is to the right of the imaginary axis."""
+        """True if small motions grow at this value of the setting.
+
+        An edge lies between two neighbouring values of which only one is unstable.
+        """
         return self.growth_per_s > 0.0
 
 

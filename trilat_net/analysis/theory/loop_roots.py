@@ -98,7 +98,7 @@ class _EndLoop(NamedTuple):
     programs: tuple[str, ...] = ()
 
     def compute_sampled_roots(self, count: int) -> Spectrum | None:
-        """Computes the rightmost roots of the loop with its ticks.
+        """Computes the rightmost roots of the loop, whose controllers compute once per tick.
 
         Args:
             count: Number of roots.
@@ -111,6 +111,9 @@ class _EndLoop(NamedTuple):
 
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     """Computes whether small motions about the end pose of a recorded run die away.
+
+    The coupled arms are linearised at the pose at rest next to the last one. The result may
+    prove the run stable, or refute it.
 
     Args:
         log: The log of the run.
@@ -130,6 +133,9 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     """Computes whether small motions about the end pose of a simulated run die away.
 
+    The result is that of `find_log_roots` for a log of the same run, but no log is needed.
+    Studies with many runs use this function.
+
     Args:
         scenario: The experiment.
         run: Its run in the fused loop.
@@ -145,7 +151,7 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
 
 
 def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
-    """Finds the control loop at the end of a recorded run, and the rest next to its end.
+    """Finds the control loop at the end of a recorded run, and the pose of rest near its end.
 
     Args:
         log: The log of the run.
@@ -166,7 +172,19 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
             raise ScenarioError(problem, source=log.source)
 
     def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns the samples of site j that site i used, from its records."""
+        """Returns which samples of a peer a site had in use at given ticks, from its records.
+
+        A sample is the state that a site sends once per tick, and samples are numbered from 0.
+        A tick without a record has the samples of the last record before.
+
+        Args:
+            i: Index of the receiving site.
+            j: Index of the peer that sent the samples.
+            ticks: Ticks of the receiving site, shape (K,).
+
+        Returns:
+            Numbers of the samples, shape (K,). Negative before the first sample.
+        """
         site_log = site_logs[i]
         rows_after = np.searchsorted(site_log.tick, ticks, side="right")
         rows = np.maximum(rows_after - 1, 0)
@@ -208,7 +226,20 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         return find_log_loop(simulate_scenario(ended), own_laws=True)
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns the samples of site j that site i used, as its link draws them."""
+        """Returns which samples of a peer a site had in use at ticks, by the delay model.
+
+        The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
+        without a log has no records, but the random delays of the link can be drawn again from
+        its seed.
+
+        Args:
+            i: Index of the receiving site.
+            j: Index of the peer that sent the samples.
+            ticks: Ticks of the receiving site, shape (K,).
+
+        Returns:
+            Numbers of the samples, shape (K,). -1 before the first sample.
+        """
         site = ended.names[i]
         peer = ended.names[j]
         name = f"{peer}->{site}"
@@ -567,7 +598,7 @@ class _SiteMotion(NamedTuple):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
+        """True if no joint exceeded `SETTLED_SPEED_RAD_S` in the last second of the run."""
         in_last_second = self.t_s > self.t_s[-1] - 1.0
         last_speeds = np.abs(self.qd[in_last_second])
         return float(last_speeds.max()) <= SETTLED_SPEED_RAD_S

@@ -88,9 +88,10 @@ class _EffectiveDelay(NamedTuple):
 
     @property
     def varies(self) -> bool:
-        """True if the age is not constant.
+        """True if the age of the used samples is not constant.
 
-        Times of ticks are whole nanoseconds, so that constant ages differ a little.
+        Differences up to 10 ns do not count, because the times of ticks are whole nanoseconds,
+        so that constant ages differ a little.
         """
         return self.most_s > self.least_s + 1e-8
 
@@ -170,8 +171,8 @@ class OperatingConditions(NamedTuple):
     def has_forms(self) -> bool:
         """True if gains alone do not describe the control law of some site.
 
-        A site is a process that runs one arm. Examples are laws that store numbers, or send
-        waves. The coupled arms are then linearised in continuous time only.
+        Examples are laws that store numbers from tick to tick, or send waves. The coupled arms
+        are then linearised in continuous time only, and not tick by tick.
         """
         return any(form is not None for form in self.find_forms())
 
@@ -219,6 +220,8 @@ def derive_operating_conditions(
     scenario: Scenario, *, own_laws: bool = True
 ) -> OperatingConditions:
     """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
+
+    They are delays, dominance factors, gains and operators, after all planned changes.
 
     Args:
         scenario: The description of the experiment.

@@ -232,12 +232,12 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The word for a port: "joint", or "axis" in task space."""
+        """The word for a port in texts: "joint", or "axis" for arms in task space."""
         return "axis" if self.axes else "joint"
 
     @property
     def speed(self) -> str:
-        """Symbol of the velocities at which operators move the arms, for tables and figures.
+        """Symbol of the velocity of a port, for tables and figures.
 
         It is "qd" for joints, and "xd" if end effectors follow each other.
         """

@@ -80,10 +80,11 @@ class Passivity(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if the loop is passive: if Y + Y^H has no negative eigenvalue.
+        """True if the loop is passive at all analysed frequencies.
 
-        Y^H is the conjugate transpose of the admittance Y. All analysed frequencies are
-        considered.
+        This means that Y + Y^H has no negative eigenvalue, where Y is the admittance of the
+        ports and Y^H its conjugate transpose. The loop then never returns more energy than it
+        received.
         """
         return not self.minima.below
 

@@ -213,12 +213,16 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
 
 
 def to_imaginary_axis(w_rad_s: Array) -> Complex:
-    """Returns j w for frequencies w, in rad/s."""
+    """Returns the points s = j w at which a frequency response is evaluated, in 1/s.
+
+    Args:
+        w_rad_s: Frequencies w, in rad/s.
+    """
     return np.asarray(1j * w_rad_s, dtype=np.complex128)
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the name of the site to which a port or a state belongs.
+    """Returns the name of the site to which a port or a state of a linear loop belongs.
 
     Args:
         port: Name of the port or state. For "m1.tau2" the site is "m1".
@@ -241,7 +245,7 @@ def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
 
 
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
-    """Finds the ports of a site, the joints at which its operator acts.
+    """Finds the ports of a site, the joints at which its operator acts on the loop.
 
     Args:
         loop: The loop.
@@ -276,6 +280,8 @@ def _parse_port_joint(port: str) -> int:
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
     """Groups the ports of a loop by the number of their joint, in the order of the sites.
 
+    Ports of the same joint can be analysed together, apart from the other joints.
+
     Args:
         loop: The loop.
 
@@ -292,6 +298,9 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     """Returns the response at some ports, while no operator acts at the others.
 
+    A port at which no operator acts has the torque zero, so that its rows and columns are left
+    out.
+
     Args:
         response: The response at all ports, as a function of frequency.
         ports: Indices of the ports to keep.
@@ -305,7 +314,10 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
 
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of a loop, in s. 0 if it has no delay."""
+    """Returns the longest delay of any link or signal in a linear loop, in s.
+
+    Returns 0 for a loop without delays.
+    """
     delays_s = [term.delay_s for term in loop.delayed]
     return max(delays_s, default=0.0)
 
@@ -487,8 +499,9 @@ class Transparency(NamedTuple):
     def softest_nm_s_rad(self) -> float:
         """Mean impedance that the operator feels while the other arm is free, in N m s/rad.
 
-        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
-        which are weighted as on a logarithmic axis.
+        The smaller it is, the less the operator feels of the arms themselves. It is the
+        geometric mean of the impedance's magnitude over the frequencies of `band_hz`, which are
+        weighted as on a logarithmic axis.
         """
         return self._average_magnitude(self.free)
 
@@ -496,8 +509,9 @@ class Transparency(NamedTuple):
     def stiffest_nm_s_rad(self) -> float:
         """Mean impedance that the operator feels while the other arm is clamped, in N m s/rad.
 
-        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
-        which are weighted as on a logarithmic axis.
+        The larger it is, the harder a rigid obstacle feels. It is the geometric mean of the
+        impedance's magnitude over the frequencies of `band_hz`, which are weighted as on a
+        logarithmic axis.
         """
         return self._average_magnitude(self.clamped)
 

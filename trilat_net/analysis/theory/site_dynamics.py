@@ -124,7 +124,7 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
-    """Returns the model of a site's arm in given poses.
+    """Returns the model of a site's arm in given poses, whose methods need no joint angles.
 
     Args:
         site: Setup of the site.

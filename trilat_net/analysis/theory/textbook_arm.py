@@ -306,7 +306,10 @@ class PlacedChain:
         return self.required_torque(theta, zeros, zeros, zeros)
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), including the drives, shape (n, n, ...).
+        """Returns the inertia matrix M(q), which maps joint accelerations to torques.
+
+        It includes the inertia of the drives. The shape is (n, n, ...), with one matrix for
+        each set of joint angles.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).
@@ -364,7 +367,10 @@ class PlacedChain:
         return total
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector in the base, shape (3, ...), in m."""
+        """Returns the position of the end effector in the frame of the base, in m.
+
+        The shape is (3, ...), with one column for each set of joint angles.
+        """
         last = self._links[-1]
         tip_m = np.array(self._chain.tip_m)
         tip = _repeat_columns(tip_m, self._columns)
@@ -372,23 +378,29 @@ class PlacedChain:
         return last.place_m + tip_offset_m
 
     def end_effector_orientation(self) -> Numbers:
-        """Returns the orientation of the end effector in the base, shape (3, 3, ...)."""
+        """Returns the rotation matrix of the end effector in the frame of the base.
+
+        The columns of a matrix are the axes of the end effector. The shape is (3, 3, ...), with
+        one matrix for each set of joint angles.
+        """
         R_last = self._links[-1].R_base
         R_tip = self._chain.tip_rotation
         orientation: Numbers = np.einsum("ab...,bc->ac...", R_last, R_tip)
         return orientation
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian of the end effector's position, shape (3, n, ...).
+        """Returns the Jacobian J of the end effector's position: its velocity is J qd.
 
-        The entries are in m/rad, or without unit for a prismatic joint.
+        The shape is (3, n, ...). The entries are in m/rad, or without unit for a prismatic
+        joint.
         """
         return self.pose_jacobian()[:3]
 
     def pose_jacobian(self) -> Numbers:
-        """Returns the Jacobian of the end effector's linear and angular velocity.
+        """Returns the Jacobian J of the end effector's velocity, in the axes of the base.
 
-        Its axes are those of the base, and its shape is (6, n, ...).
+        J qd has the linear velocity in its first three rows, and the angular velocity in its
+        last three. The shape is (6, n, ...).
         """
         last = self._links[-1]
         return self._move_to_tip(last.J)

@@ -89,7 +89,10 @@ class EnvelopeFit(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The trend of the envelope in a few words for the user, such as "grows"."""
+        """The trend of the envelope in a few words for the user, such as "grows".
+
+        An undecided trend reads "shows no trend".
+        """
         if self.trend is EnvelopeTrend.UNDECIDED:
             return "shows no trend"
         return self.trend.value

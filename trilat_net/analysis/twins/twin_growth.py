@@ -191,7 +191,8 @@ class TwinGrowth(NamedTuple):
     def worst(self) -> PushGrowth | None:
         """The push whose effect grew most, or died away most slowly.
 
-        A push is a small disturbance in a repetition of the run. None if there are no pushes.
+        A push is a small disturbance in a repetition of the run. The trend of this push counts
+        as the trend of the whole run. None if there are no pushes.
         """
         return max(self.pushes, key=_rank_badness, default=None)
 
@@ -250,7 +251,8 @@ class TwinGrowth(NamedTuple):
     def hides_period(self) -> bool:
         """True if the delays repeat only after more time than the judged part of the run.
 
-        A trend over a part of the period of the delays says nothing about the whole period.
+        Pushes that died away in this part might then grow in the rest of the period. A decision
+        without a proof therefore stays open.
         """
         judged_s = self.to_s - self.from_s
         return self.delay_period_s is not None and self.delay_period_s > judged_s
@@ -259,8 +261,8 @@ class TwinGrowth(NamedTuple):
     def judged_bursts(self) -> float:
         """Mean number of bursts of lost samples in the judged part of the run.
 
-        That of the link with the fewest bursts counts. Infinite if no link loses samples in
-        bursts.
+        A trend over few bursts says little about the run with more of them. The link with the
+        fewest bursts counts. Infinite if no link loses samples in bursts.
         """
         if self.burst_interval_s is None:
             return math.inf
@@ -268,7 +270,12 @@ class TwinGrowth(NamedTuple):
 
     @property
     def period_text(self) -> str:
-        """A sentence for a judged part that is shorter than the period of the delays."""
+        """A sentence for repetitions that were shorter than the period of the delays.
+
+        Pushes that died away then prove little, because the delays of the rest of the period
+        were never tried. For example "the delays repeat after 20 s, but the twins were judged
+        over 8 s".
+        """
         judged_s = self.to_s - self.from_s
         return (
             f"the delays repeat after {self.delay_period_s:.6g} s, but the twins were judged "
@@ -301,9 +308,10 @@ class TwinGrowth(NamedTuple):
         return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Returns how each small push of the run grows or dies away, as plain values.
+        """Returns the trend of each push, and of all together, as plain values for JSON.
 
-        They are ready for JSON.
+        The trend of a push states how its effect developed, with its rate in 1/s and the factor
+        by which it grew or fell. Numbers that are not finite become None.
         """
         pushes = [
             {
@@ -802,6 +810,8 @@ class PushedTwins(Result):
     def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence for the user on whether the effect of a push grows or dies away.
 
+        The sentence names the push, such as its joint and size, and the rate.
+
         Args:
             pushed: The push and its effect.
         """
@@ -845,9 +855,9 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the pushes and how they develop as plain values, ready for JSON.
+        """Returns the pushes and how they develop, with the keys of `trilat twin --json`.
 
-        The keys are those of `trilat twin --json`.
+        The entry "linear" is None if the growth was not compared with characteristic roots.
         """
         growth = self.growth.to_json()
         return {

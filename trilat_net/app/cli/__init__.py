@@ -104,7 +104,10 @@ class _Group(TyperGroup):
             self.commands.setdefault(str(command.name), command)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Finds the command that the arguments name.
+        """Finds the command that the first argument names.
+
+        Click calls this method before it runs a command. For an unknown name, for example a
+        word of another program or a typing error, the nearest command is suggested.
 
         Raises:
             UsageError: There is no such command. The error suggests one.
@@ -130,7 +133,10 @@ class _Command(TyperCommand):
     """A command that recognises a setting which the shell has split into several arguments."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """Parses the arguments of the command.
+        """Parses the arguments of the command, and detects a value that the shell has split.
+
+        For example, --set dominance.m1={m2=0.1,s=0.9} without quotes becomes two arguments in
+        some shells. The general error of Click would not explain this.
 
         Raises:
             UsageError: The value of an option --set was not quoted, and the shell has split it.
@@ -153,13 +159,19 @@ class _Commands(_Group):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Returns the names of all commands in the order of the help."""
+        """Returns the names of all commands in the order of the help, which has panels.
+
+        Commands of other packages without a place in this order come last.
+        """
         positions = {name: n for n, name in enumerate(_PANEL_OF)}
         end = len(positions)
         return sorted(super().list_commands(ctx), key=lambda name: positions.get(name, end))
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs a command; Ctrl-C ends it with the exit code of the signal."""
+        """Runs a command, and turns Ctrl-C into a line "interrupted" and an exit code.
+
+        The exit code is that of the signal, or 130, so that shell scripts stop as well.
+        """
         with Interrupt() as interrupt:
             try:
                 with interrupt.raising():
@@ -249,7 +261,11 @@ class _PackageCommand(TyperCommand):
 
     @_deferred
     def short_help(self) -> str:
-        """The first sentence of the help, or why there is no help."""
+        """The first sentence of the help, which the list of all commands shows.
+
+        For known packages it is in a table, because importing every package would make the help
+        slow. If the command cannot be imported, the reason takes its place.
+        """
         package = find_package(COMMANDS, self._entry_name)
         if package:
             return PACKAGE_COMMANDS[package][self._entry_name]
@@ -260,17 +276,17 @@ class _PackageCommand(TyperCommand):
 
     @_deferred
     def help(self) -> Any:
-        """The help of the imported command."""
+        """The help of the command. Reading it imports the package."""
         return self._command.help
 
     @_deferred
     def epilog(self) -> Any:
-        """The text below the help of the imported command."""
+        """The text below the help of the command. Reading it imports the package."""
         return self._command.epilog
 
     @_deferred
     def params(self) -> Any:
-        """The options and arguments of the imported command."""
+        """The options and arguments of the command. Reading them imports the package."""
         return self._command.params
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
@@ -447,7 +463,11 @@ def _run() -> None:
 
 
 def main() -> None:
-    """Runs `trilat`. An error becomes one sentence and an exit code."""
+    """Runs `trilat`, the program that users start in a terminal.
+
+    A known error becomes one sentence and the exit code of its class, without a traceback.
+    System errors, such as a full disk, are explained as well.
+    """
     TrilatError.in_command = True
     try:
         _run()

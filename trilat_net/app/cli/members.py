@@ -213,13 +213,19 @@ def record_command(
     clock = make_system_clock(clock_offset, clock_drift)
 
     def warn_of_load() -> None:
-        """Warns if other programs keep the processors of this machine busy."""
+        """Prints a note if other programs keep the processors of this machine busy.
+
+        A busy machine may record late or lose messages, but the recording goes on.
+        """
         warning = check_machine_load(clock)
         if warning:
             terminal.print_note(warning)
 
     def conclude() -> None:
-        """Checks the finished log and writes its report, if the option --conclude was given."""
+        """Checks the finished log and writes its report, if the option --conclude was given.
+
+        A log in several files is treated as one.
+        """
         if concluded:
             _conclude(list(find_parts(path).values()), png=png)
 
@@ -455,7 +461,11 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
     last_position_ns = 0
 
     def show(progress: "PlayProgress") -> None:
-        """Overwrites the line of the terminal with the present progress."""
+        """Overwrites the line of the terminal with the present progress of playing a log.
+
+        The line shows the position in the log, the speed since the last line ("x1.00" is real
+        time), the number of published messages, and their largest lateness.
+        """
         nonlocal last_now_ns, last_position_ns
         now_ns = clock.monotonic_ns()
         position_ns = progress.position_ns

@@ -34,6 +34,8 @@ def check_range(
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
     """Returns a function that refuses the number of an option if it is out of a range.
 
+    Typer calls the function, so that the error names the option.
+
     Args:
         low: The smallest number.
         high: The largest number.
@@ -86,7 +88,7 @@ def flag(names: str, text: str = "", **settings: Any) -> Any:
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Declares a command line option with a time to wait, from 0 s to one day.
+    """Declares a command-line option with a time to wait, from 0 s to one day.
 
     Args:
         name: Name of the option, such as "--timeout".
@@ -142,7 +144,10 @@ _NO_LAWS = ("conditions", "interface", "sent_vectors")
 
 
 def list_laws() -> list[str]:
-    """Lists the names of the built-in control laws, without importing their modules."""
+    """Lists the names of the built-in control laws, for help texts and error messages.
+
+    The names are those of the files, so that no module needs to be imported, which takes long.
+    """
     folder = str(Path(__file__).parents[2] / "laws")
     return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
 
@@ -175,7 +180,7 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Lists the sites with which a shell may complete a word.
+    """Lists the sites with which a shell may complete a word of the command line.
 
     Args:
         context: The command line, whose scenario or log has the sites.
@@ -424,6 +429,8 @@ AllOption = Annotated[
 def check_picture(path: Path | None, *, force: bool) -> None:
     """Refuses the path of a figure that cannot be written.
 
+    The check is made before the result is computed, which may take long.
+
     Args:
         path: Path of the figure. None if no figure was requested.
         force: True to replace an existing file.
@@ -450,6 +457,9 @@ def print_and_draw(
 ) -> None:
     """Prints a result, and writes a figure of it if a path is given.
 
+    The module that draws is imported only if a figure is requested, because Matplotlib is slow
+    to import.
+
     Args:
         result: The result.
         picture: Path of the figure. None for no figure.
@@ -472,7 +482,7 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Returns the scenario that the options of a command describe.
+    """Loads the scenario of a command, and applies the options that change it.
 
     Args:
         source: Name of a shipped scenario, or path of a TOML file.
@@ -486,7 +496,12 @@ def load_chosen_scenario(
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
-    """Returns the overrides of --set and --duration, in this order."""
+    """Returns the changes of the scenario that --set and --duration ask for, in this order.
+
+    Args:
+        overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
+        duration: Value of --duration, in s. It becomes "duration_s=10.0". None if absent.
+    """
     texts = list(overrides or [])
     if duration is not None:
         texts.append(f"duration_s={duration!r}")
@@ -494,15 +509,21 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Splits a text of names such as "adaptive,p_d". None gives an empty list."""
+    """Splits the names that an option lists: "adaptive, p_d" gives ["adaptive", "p_d"].
+
+    None, which stands for an absent option, gives an empty list.
+    """
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def list_used_options(context: typer.Context) -> list[str]:
     """Lists the options and arguments that the user wrote on the command line.
 
+    Commands use the list to refuse combinations: an option with its default value is no
+    conflict.
+
     Returns:
-        The first name of each, in the order of declaration.
+        The first name of each, for example "--seed", in the order of declaration.
     """
     used = []
     for param in context.command.params:
@@ -513,10 +534,10 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """The options by which a process takes part in a session as one of its members.
+    """The options with which a process takes part in a session as one of its members.
 
-    The members of a session are its sites and recorders. A connection listens at some endpoints
-    and connects to others.
+    The members of a session are its sites and recorders. The options say at which endpoints the
+    process listens, to which it connects, and with which keys.
     """
 
     listen: ListenOption = None
@@ -582,9 +603,10 @@ class MemberOptions(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """Command line options with which a command connects to a running session from outside.
+    """The options with which a command connects to a running session from outside.
 
-    The command only observes or changes the session. It is not one of its sites or recorders.
+    The command only observes or changes the session. It is not one of its sites or recorders,
+    and therefore does not listen for connections.
     """
 
     connect: ConnectOption = None
@@ -657,7 +679,11 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """The options of a command that runs a session on this machine and reports on it."""
+    """The options of a command that runs a session on this machine and reports on it.
+
+    The options override parts of the scenario (`load`), name the folder of the results, and say
+    what is written and printed.
+    """
 
     duration: DurationOption = None
     folder: Annotated[

@@ -39,15 +39,23 @@ def demo_command(
 
 
 class _SessionPage(Protocol):
-    """A page in a browser that shows a session, and offers its results afterwards."""
+    """A page in a browser that shows a session, and offers its results afterwards.
+
+    The package trilat-people provides one. The commands use only these two methods, so that
+    they also work without this package.
+    """
 
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> AbstractContextManager[Callable[[], bool]]:
-        """Shows the session while it runs, see `SessionAttendant`."""
+        """Shows the session while it runs. `SessionAttendant` explains arguments and result."""
 
     def offer_results(self, paths: Iterable[Path]) -> None:
-        """Offers the report and the log to those who look at the page."""
+        """Offers the report and the log for download to those who look at the page.
+
+        Args:
+            paths: Files that the run has written.
+        """
 
 
 def _describe_log(path: Path) -> str:

@@ -83,7 +83,11 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
 
 
 def _limit_by_later(values: Ints) -> Ints:
-    """Returns for each value the smallest of it and all later values, shape (K,)."""
+    """Returns for each value the smallest of it and all later values, shape (K,).
+
+    For example, the values 1, 5, 3, 4 give 1, 3, 3, 4. A message must not be played after one
+    with a higher number, even if its time is later.
+    """
     return np.minimum.accumulate(values[::-1])[::-1]
 
 
@@ -108,12 +112,18 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Deadline of each message after the start of the session, shape (K,), in ns."""
+        """Time at which each message is due, in ns after the start of the session, shape (K,).
+
+        The player publishes each message at this time, scaled by the speed of playing.
+        """
         return self.rows[:, _TIME]
 
     @property
     def end_ns(self) -> int:
-        """Time at which the last message is due, in ns after the start of the session."""
+        """Time at which the last message is due, in ns after the start of the session.
+
+        An empty batch has no such time, and raises IndexError.
+        """
         return int(self.times_ns[-1])
 
     @property
@@ -169,6 +179,8 @@ class MessageBatch:
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
         """Divides the messages into pieces of limited size, without copying their payloads.
 
+        A piece is sent at once, so that its size limits the memory.
+
         Args:
             size: Approximate size of a piece, in bytes. A piece with one message may be larger.
 
@@ -186,7 +198,8 @@ class MessageBatch:
     def compact(self) -> "MessageBatch":
         """Copies the messages into a batch whose buffer contains only their payloads.
 
-        This frees memory if the batch is a small part of a large buffer.
+        A batch may be a small part of a large buffer, which stays in memory as long as the
+        batch. The copy frees the large buffer.
         """
         view = memoryview(self.data)
         spans = self.rows[:, _START:].tolist()
@@ -225,7 +238,7 @@ class BatchBuilder:
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message to those that will be sorted.
+        """Adds a message, in the order of the file, to those that will be sorted for playing.
 
         Args:
             t_ns: Time of the message after the start of the session, in ns.

@@ -207,14 +207,18 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Supplies the messages again from the first one, when a log is played in a loop."""
+        """Supplies the messages again from the first one, when a log is played in a loop.
+
+        A log in memory is queued once more. For a long log, the reader process begins again on
+        its own.
+        """
         self.ended = False
         if self._batch is not None:
             self._ahead.append(_ReadPiece(self._header.topics, self._batch))
             self._ahead.append(_RoundEnd(0, {}))
 
     def close(self) -> None:
-        """Ends the reader process, if there is one. Further calls have no effect."""
+        """Ends the reader process and its pipe, if they exist. Further calls have no effect."""
         if self._process is not None:
             self._process.terminate()
             self._process.join()
@@ -347,7 +351,11 @@ def feed_player(
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
     def send(item: _ReadPiece | _RoundEnd | LogError) -> None:
-        """Writes an item to the pipe, and waits until there is room."""
+        """Writes an item to the pipe, and waits until the player has made room.
+
+        The wait limits how far the reader runs ahead, and thus the memory. Each item is
+        preceded by its size, so that the player knows where it ends.
+        """
         pickled = pickle.dumps(item)
         sink.write(SIZE.pack(len(pickled)) + pickled)
         sink.flush()

@@ -54,7 +54,7 @@ class Pace:
     rate: float = 1.0
 
     def due_ns(self, t_ns: int) -> int:
-        """Computes the deadline of a message.
+        """Computes the deadline of a message: the time on the player's clock when it is due.
 
         Args:
             t_ns: Time of the message in the log, in ns after the start of the recorded session.
@@ -139,7 +139,10 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Histogram of the lateness: the time from the deadline of a message to its publication.
+    """Counts messages by their lateness: the time from the deadline to the publication.
+
+    Percentiles can be computed at any time from the counts, without storing every lateness. The
+    width of an interval is 1 us.
 
     Attributes:
         max_us: Largest lateness, in us.
@@ -150,7 +153,9 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Adds the lateness of one published message to the histogram.
+        """Counts the lateness of one published message.
+
+        The method is called for every message, and must therefore be fast.
 
         Args:
             late_ns: Time from the deadline of the message to its publication, in ns.
@@ -206,7 +211,7 @@ Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """Progress of a playback.
+    """How far the playing of a log has come, for the line that the user sees.
 
     Attributes:
         position_ns: Time of the next message, in ns after the start of the recorded session.
@@ -275,7 +280,7 @@ class Player:
         self._first_batch: MessageBatch | None = None
 
     def prepare(self) -> int | None:
-        """Waits for the first messages.
+        """Waits for the first messages, so that playing can begin without delay.
 
         Returns:
             The time of the first message, in ns after the start of the recorded session. None

@@ -299,7 +299,7 @@ class SessionReader:
         self._progress = progress
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the selected messages in the order of the files.
+        """Yields the selected messages of all files, file by file, in the order of each file.
 
         Raises:
             LogError: A file is missing, is no log of trilat-net, or belongs to another session

@@ -116,7 +116,8 @@ class PlayedHistory:
     def clear(self) -> None:
         """Removes all stored messages, before a log is played again from its beginning.
 
-        The attribute `next_numbers` is not changed.
+        The next number of each topic (`next_numbers`) is kept, so that the numbers of messages
+        do not start again.
         """
         self._messages.clear()
 

@@ -163,7 +163,7 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Encodes one message.
+        """Encodes one message of the type `sensor_msgs/msg/JointState`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -261,7 +261,10 @@ def pack_string(text: str) -> bytes:
 
 
 class RosLogLevel(IntEnum):
-    """Severity of a line in the log of ROS, with the numbers that ROS 2 defines."""
+    """Severity of a line in the log of ROS, with the numbers that ROS 2 defines.
+
+    Events of a session become such lines. For example, an arm that diverged is an ERROR.
+    """
 
     INFO = 20
     WARN = 30
@@ -269,7 +272,7 @@ class RosLogLevel(IntEnum):
 
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
-    """Encodes a line for the log of ROS, `rcl_interfaces/msg/Log`.
+    """Encodes a line for the log of ROS, a message of the type `rcl_interfaces/msg/Log`.
 
     Args:
         stamp_ns: Unix time of the line, in ns, 0 or more.
@@ -306,6 +309,9 @@ def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
     """Encodes the response of a ROS service of the type `std_srvs/srv/Trigger`.
 
+    Such a service does something, for example it stops an arm, and reports whether it
+    succeeded.
+
     Args:
         success: True if the request was carried out.
         text: Explanation for the caller of the service.
@@ -315,6 +321,8 @@ def pack_trigger_response(*, success: bool, text: str) -> bytes:
 
 class Diagnosis(NamedTuple):
     """Status of one component, as a message of the ROS topic `/diagnostics` reports it.
+
+    Monitors of robots show these statuses, with a colour for each level.
 
     Attributes:
         level: 0 if the component is ok, 1 for a warning, 2 for an error, 3 if the status is too
@@ -392,10 +400,11 @@ class _CdrReader:
     def count(self) -> int:
         """Decodes the number of entries of a list, which precedes the entries in the message.
 
-        Each entry must have at least one byte.
+        Each entry has at least one byte. A number above the remaining bytes is therefore wrong,
+        and is refused before memory is reserved for the entries.
 
         Raises:
-            ValueError: Fewer bytes than entries remain. The number must therefore be wrong.
+            ValueError: Fewer bytes than entries remain.
         """
         (count,) = self.numbers("I")
         # A wrong length would let the caller reserve memory for entries that do not exist.
@@ -416,14 +425,18 @@ class _CdrReader:
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Decodes the next header: its stamp in ns on the sender's clock, and its frame."""
+        """Decodes a `std_msgs/msg/Header`, with which many messages begin.
+
+        Returns:
+            The time stamp in ns on the sender's clock, and the name of the coordinate frame.
+        """
         (whole_s,) = self.numbers("i")
         (rest_ns,) = self.numbers("I")
         return whole_s * NS_PER_S + rest_ns, self.text()
 
 
 class RosJoints(NamedTuple):
-    """State of a robot's joints, from a message of the type `sensor_msgs/msg/JointState`.
+    """State of a robot's joints, decoded from a message `sensor_msgs/msg/JointState`.
 
     Attributes:
         stamp_ns: Time of the message on the sender's clock, in ns.
@@ -462,7 +475,9 @@ def read_joint_state(payload: bytes) -> RosJoints:
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
-    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray` of any shape.
+    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray` in the order of the message.
+
+    The layout, which states the sizes of the dimensions, is skipped.
 
     Raises:
         ValueError: The message cannot be decoded.

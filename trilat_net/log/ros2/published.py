@@ -61,7 +61,7 @@ COMMON_TOPICS = {
 
 
 def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
-    """Lists all ROS 2 topics under which a session is published.
+    """Lists all ROS 2 topics under which a session is published, by the bridge or in a bag.
 
     Args:
         scenario: Scenario of the session, its description in a TOML file.
@@ -210,7 +210,7 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Computes the time stamp of a record's messages.
+        """Computes the time stamp of all messages that are made from one record.
 
         Args:
             record: The record.
@@ -409,7 +409,7 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Encodes the poses of all links of the arm, for viewers that draw it.
+        """Encodes the poses of all links of the arm in a tick, for viewers that draw the arm.
 
         Args:
             record: The record, which contains the joint positions.
@@ -431,7 +431,7 @@ class SiteMessages:
             yield self._pack_shared_frame(stamp_ns, numbers)
 
     def pack_statistics(self, stats: LinkStats) -> NamedMessages:
-        """Encodes the statistics of a site's links.
+        """Encodes the statistics of a site's links, such as ages and losses.
 
         Args:
             stats: The statistics.

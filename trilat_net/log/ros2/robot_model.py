@@ -66,7 +66,7 @@ class _JointFrame(NamedTuple):
     q_index: int
 
     def compute_transform(self, position: float) -> Transform:
-        """Computes the pose of the link's frame in the parent link's frame.
+        """Computes the pose of the link relative to its parent, for a position of the joint.
 
         Args:
             position: Position of the joint, in rad or m.
@@ -133,7 +133,7 @@ def _rotate_about(axis: Vector, angle: float) -> Quaternion:
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
-    """Converts a rotation vector to a unit quaternion.
+    """Converts a rotation vector to a unit quaternion (x, y, z, w).
 
     Args:
         rotation_vector: Axis of the rotation times its angle, in rad.
@@ -243,6 +243,8 @@ class RobotModel:
 
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
         """Computes where the links of the arm are, for given positions of its joints.
+
+        Viewers draw the arm from these poses.
 
         Args:
             q: Positions of the joints, in rad or m.

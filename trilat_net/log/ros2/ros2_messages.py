@@ -316,7 +316,7 @@ class Ros2SiteChannels:
         return channels
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
-        """Returns a channel of joint states.
+        """Returns a channel of joint states, the usual message with the joints of a robot.
 
         Args:
             names: Names of the joints.
@@ -525,7 +525,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
 
 
 def _transpose(rows: Iterable[SignalRow]) -> list[SignalRow]:
-    """Returns the columns of rows of equal length."""
+    """Returns the columns of a table as rows: one sequence per curve, not per record."""
     return [*zip(*rows, strict=True)]
 
 
@@ -542,7 +542,11 @@ def _compute_errors(
 
 
 def _list_modes(records: Sequence[Record]) -> list[float]:
-    """Returns the mode of each record as a number, or only one number if all are equal."""
+    """Returns the mode of each record as a number, or a single number if all are equal.
+
+    The extremes of a bucket of equal modes are thus one point, which saves most of the
+    messages.
+    """
     modes = [record.mode for record in records]
     first_mode = modes[0]
     if modes.count(first_mode) == len(modes):

@@ -95,6 +95,8 @@ class TopicTable(NamedTuple):
     def find(self, session: str, site: str, topic: str) -> str:
         """Returns the full name of a site's topic in ROS 2, without the first /.
 
+        The user's names have precedence over the names of trilat-net.
+
         Args:
             session: Name of the session.
             site: Name of the site.

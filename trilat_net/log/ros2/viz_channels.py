@@ -226,7 +226,11 @@ class _SiteBuckets:
         self._write_message(ros2_messages.FRAMES, frames, stamp_ns, log_ns)
 
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
-        """Writes the exogenous torque, the estimate, the law's numbers, and the mode."""
+        """Writes the quantities that viewers need less often than the joints.
+
+        They are the external torque, the estimate of the arm, the numbers that the law sends,
+        and the mode.
+        """
         for name, data in self._site_channels.pack_slow_arrays(row):
             self._write_message(name, data, stamp_ns, log_ns)
 
@@ -266,7 +270,11 @@ class _SiteBuckets:
         self._records.append(record)
 
     def _add_late_record(self, record: Record, log_ns: int) -> None:
-        """Keeps a record of a bucket that was written, until one of another bucket arrives."""
+        """Keeps a record whose bucket was written already, because the record arrived late.
+
+        Late records of one bucket are collected, and written as soon as a late record of
+        another bucket arrives.
+        """
         bucket = record.tick // self._bucket_ticks
         if self._late_records:
             late_bucket = self._late_records[0].tick // self._bucket_ticks
@@ -500,7 +508,10 @@ class VizChannels:
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes."""
+        """Upper bound for the size of the messages that are not written yet, in bytes.
+
+        The messages of a bucket are written when the bucket ends.
+        """
         return sum(buckets.max_pending_bytes for buckets in self._buckets)
 
 
@@ -516,7 +527,13 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
         return None
 
     def make_views(session: str, epoch_unix_ns: int, put: PutMessage) -> VizChannels:
-        """Creates the messages for viewers of one file."""
+        """Creates the messages for viewers of one file of the log.
+
+        Args:
+            session: Name of the session.
+            epoch_unix_ns: Start of the session, in ns since 1970.
+            put: Function that writes a message.
+        """
         return VizChannels(scenario, session, epoch_unix_ns, views_hz, put)
 
     return make_views

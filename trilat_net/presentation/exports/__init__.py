@@ -11,6 +11,7 @@ import pkgutil
 def list_export_formats() -> list[str]:
     """Lists the names of all formats in which a log can be exported.
 
-    Each format is a module in this folder and has its name.
+    Each format is a module in this folder and has its name. The modules are not imported, so
+    that the help of `trilat export` can list the formats quickly.
     """
     return [module.name for module in pkgutil.iter_modules(__path__)]

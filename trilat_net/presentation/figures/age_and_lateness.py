@@ -126,6 +126,8 @@ def _add_link_panels(
 def has_varying_delay(log: Log) -> bool:
     """Tells whether the delays of a run vary, so that their distribution is of interest.
 
+    Figures and pages leave the distribution out otherwise.
+
     Args:
         log: Log of the run.
 
@@ -211,6 +213,8 @@ def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
 def compute_cumulative_percent(values: Array, limits: Array) -> Array:
     """Returns the percentage of values that do not exceed each limit.
 
+    The points are the cumulative distribution of the values, for example of ages.
+
     Args:
         values: The values to count, shape (K,).
         limits: The limits, shape (P,).
@@ -226,6 +230,8 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
 
 def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
     """Returns the mean delay that the scenario states for a link, as the points of a line.
+
+    The figure draws it dashed beside the measured ages, which should agree with it.
 
     Args:
         log: Log of the run.
@@ -263,6 +269,8 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 def is_unsteady(ages_ms: Array) -> bool:
     """Tells whether ages fluctuate so often that a line would look like a filled area.
+
+    The figure then draws the spread of the ages as a band.
 
     Args:
         ages_ms: Ages over time, shape (K,), in ms.

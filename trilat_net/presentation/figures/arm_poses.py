@@ -149,6 +149,9 @@ def trace_bodies_m(
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
     """Projects points of an arm to the plane of a picture.
 
+    A planar arm lies in the plane already. An arm in space is seen from one fixed direction,
+    with "up" opposite to gravity.
+
     Args:
         arm: Model of the arm.
         points: Points in the frame of the base, in m, shape (..., 3). Those of a planar arm
@@ -207,7 +210,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
-    """Returns the pose of a site in its last record until a time.
+    """Returns the pose of a site in its last record until a time, for drawing.
 
     Args:
         log: Log of the run.

@@ -107,7 +107,11 @@ def unless(shows: Callable[[Log], object], reason: str) -> Absent:
 
 
 def list_figures() -> dict[str, FigureEntry]:
-    """Returns all figures by name, in the order in which a paper would have them."""
+    """Returns all registered figures by name, in the order in which a paper would have them.
+
+    Figures that are not in this order, such as those of a new file, are last, in the order of
+    their registration.
+    """
     ranks = {name: rank for rank, name in enumerate(_PAPER_ORDER)}
     names = sorted(_ENTRIES, key=lambda name: ranks.get(name, len(ranks)))
     return {name: _ENTRIES[name] for name in names}

@@ -67,6 +67,8 @@ def figure(
 def list_drawable_figures(log: Log) -> list[str]:
     """Lists the names of the figures for which a log has something to show.
 
+    For example, a run without walls has no figure of contact.
+
     Args:
         log: Log of the run.
     """

@@ -47,7 +47,8 @@ class _DelayMoments(NamedTuple):
 def ms_to_us(milliseconds: float) -> int:
     """Converts a time in milliseconds to whole microseconds.
 
-    The compiled simulation uses integer times, so that results are the same on every machine.
+    Delays are rounded, because the compiled simulation must give the same bits on every
+    machine.
     """
     return round(milliseconds * 1_000)
 
@@ -158,7 +159,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def random(self) -> bool:
         """True if the delay, the losses or the duplicates of the link are drawn at random.
 
-        Then another seed of the scenario gives another run.
+        Then another seed of the scenario gives another run. Losses are drawn only if some
+        samples are lost, but not all.
         """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
@@ -167,7 +169,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def measured(self) -> bool:
         """True if the link adds no artificial delay.
 
-        Samples then arrive as the real network of a live session delivers them.
+        Samples then arrive as the real network of a live session delivers them. Such a link
+        cannot be simulated without the log of a session.
         """
         return self._delay().kind == DelayKind.MEASURED
 
@@ -221,7 +224,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return _LossChain(loss_good=0.0, loss_bad=self.loss_bad, enter=enter, leave=leave)
 
     def find_problem(self) -> KeyProblem | None:
-        """Returns a contradiction between several keys of the link.
+        """Returns a contradiction between several keys of the link, if there is one.
+
+        For example, an outage must not end before it starts. Problems of a single key are found
+        before, by the type of the key.
 
         Returns:
             The key and the reason. None if the keys agree with each other.

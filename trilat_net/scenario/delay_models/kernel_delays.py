@@ -152,7 +152,7 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Delay with a gamma distribution, which is skewed towards long delays.
+    """Delay with a gamma distribution: never negative, with a long tail of large delays.
 
     Its keys are the mean and the standard deviation.
     """
@@ -261,9 +261,9 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """Link without artificial delay.
+    """Link without artificial delay, the ideal network.
 
-    The receiver uses a sample from its next tick on.
+    The receiver uses a sample from its next tick on, since a sample cannot act in its own tick.
     """
 
     def _delay(self) -> LinkModel:
@@ -405,7 +405,8 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
     """Link of a live session to which the program adds no delay.
 
-    The receiver uses a sample as soon as it has arrived over the real network.
+    The receiver uses a sample as soon as it has arrived over the real network. A simulation
+    cannot know these arrivals.
     """
 
     def _delay(self) -> LinkModel:

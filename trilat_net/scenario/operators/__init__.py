@@ -55,10 +55,10 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """Base of all operators and environments, which exert forces on an arm.
+    """Base of all operators and environments, which exert torques or forces on an arm.
 
-    An operator is a person or program that moves the arm. An environment is a wall or another
-    body that the arm touches.
+    A subclass describes one kind by its keys in a scenario, and converts them to a record for
+    the compiled simulation. A file of this folder with such a class adds a kind.
     """
 
     group: ClassVar[str] = "hands"
@@ -67,14 +67,15 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the actor in the form that the simulation kernel uses."""
+        """Returns the actor as the record from which the kernel computes its torque."""
         raise NotImplementedError
 
     @property
     def actor(self) -> TorqueSource:
         """Operator or environment, as a record for the compiled simulation.
 
-        From this record, the compiled simulation computes the torque on the arm.
+        The kernel cannot use Python objects. From this record of numbers, it computes the
+        torque on the arm in every tick.
         """
         return self._source()
 
@@ -117,7 +118,12 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """Operator or environment that acts only from the time `start_s` to the time `end_s`."""
+    """Operator or environment that acts only in an interval of time.
+
+    Attributes:
+        start_s: Start of the interval, in s after the start of the run.
+        end_s: End of the interval, in s. By default, the actor never stops.
+    """
 
     start_s: fields.NotNegative = 0.0
     end_s: fields.Positive = fields.MAX_QUANTITY

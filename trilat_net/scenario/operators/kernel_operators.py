@@ -166,6 +166,8 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 class JointSpring(MovingSpring, frozen=True, tag="spring"):
     """Operator who pulls every joint with a spring and a damper towards a moving pose.
 
+    It is the model of a person who moves an arm to a pose and feels its resistance.
+
     Attributes:
         to_rad: Pose at the end of the motion of the target, in rad.
         from_rad: Pose before the motion, in rad. By default, the start pose of the arm.
@@ -183,6 +185,9 @@ class JointSpring(MovingSpring, frozen=True, tag="spring"):
 
 class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
     """Operator who pulls the end effector with a spring and a damper towards a moving point.
+
+    It is the model of a person who holds the end of an arm. The joints are free to arrange
+    themselves.
 
     Attributes:
         to_m: Point at the end of the motion of the target, in m, one number per axis.
@@ -218,7 +223,8 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         """Checks that the recorded torques are in the order of time.
 
         Returns:
-            The setting `points` and the reason. None if there is no problem.
+            The setting `points` and the reason. None if every time is later than the previous
+                one.
         """
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")

@@ -144,22 +144,27 @@ class HandSite(NamedTuple):
 
     @property
     def program(self) -> str:
-        """Name of the Python class that operates the arm, for example "my_policy:Reach"."""
+        """Name of the class that operates the arm, for example "my_policy:Reach".
+
+        If the scenario does not name a class, it is "a program".
+        """
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
     def has_separate_process(self) -> bool:
         """True if the program runs in a process of its own in a live session.
 
-        Otherwise it runs in the process of the site.
+        A slow program then does not delay the control loop. Otherwise the program runs in the
+        process of the site.
         """
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
     @property
     def source(self) -> str:
-        """Text that identifies the sender of the program's messages.
+        """Text by which a site recognises the messages of this program.
 
-        It consists of the class of the program and the hash of the scenario.
+        It consists of the class of the program and the hash of the scenario, for example
+        "my_policy:Reach 5cfbf3f16ec0c567". Both are cut to fit into a message.
         """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
@@ -187,10 +192,10 @@ class HandSite(NamedTuple):
         )
 
     def make_hand(self) -> OwnHand:
-        """Creates the schedule of the program that operates the arm.
+        """Creates the object that calls the program and applies its actions at the right ticks.
 
-        The schedule decides in which control periods the program is called, and in which
-        periods its actions take effect after their delay.
+        The program is called `rate_hz` times a second. An action takes effect `delay_s` after
+        the observation on which it rests, rounded up to a whole tick.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
@@ -307,7 +312,9 @@ class HandPlayer:
             self.fail(k, describe_exception(error))
 
     def fail(self, k: int, problem: str) -> None:
-        """Makes the program let go of the arm for the rest of the run.
+        """Makes the program let go of the arm for the rest of the run, because it failed.
+
+        The run goes on without it, and the reason is recorded.
 
         Args:
             k: Number of the tick in which it lets go.
@@ -324,7 +331,7 @@ class HandPlayer:
 
 
 def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Finds the program that operates the arm of a site.
+    """Finds the program that operates the arm of a site, if the scenario has one.
 
     Args:
         scenario: Description of the experiment.
