@@ -208,7 +208,7 @@ def test_the_command_says_how_to_use_it(paper: tuple[Path, Path], tmp_path: Path
     advice = trilat("log", "view", "run.mcap", "--rviz", cwd=tmp_path).succeeds()
     assert advice.splitlines() == [
         "run.rviz: during a session with `trilat ros2`, run: rviz2 -d run.rviz",
-        "  for a bag: ros2 bag play --clock BAG, and rviz2 -d run.rviz --ros-args -p use_sim_time:=true",
+        "  for a bag: ros2 bag play BAG --clock 100, and rviz2 -d run.rviz --ros-args -p use_sim_time:=true",
     ]
     assert "rviz_default_plugins/RobotModel" in (tmp_path / "run.rviz").read_text()
     trilat(*view, "--web", cwd=tmp_path).refuses("--foxglove and --rviz cannot be combined")

@@ -277,7 +277,7 @@ def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) 
         command = f"rviz2 -d {shlex.quote(str(config))}"
         terminal.print_text(f"{config}: during a session with `trilat ros2`, run: {command}")
         terminal.print_text(
-            f"  for a bag: ros2 bag play --clock BAG, and {command} --ros-args "
+            f"  for a bag: ros2 bag play BAG --clock 100, and {command} --ros-args "
             "-p use_sim_time:=true"
         )
 
