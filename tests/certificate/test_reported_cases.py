@@ -85,7 +85,7 @@ def assert_roots_decide(certificate: Certificate, rate_per_s: float) -> None:
     assert certificate.roots.rate_per_s == pytest.approx(rate_per_s, abs=5e-5)
     if rate_per_s > 0.0:
         assert certificate.stability is Stability.NOT_STABLE
-        assert certificate.decision.rests_on.startswith("exact roots, fastest growing +")
+        assert "fastest growing +" in certificate.decision.rests_on
         assert certificate.roots.text in certificate.reasons
     else:
         assert certificate.stability is Stability.STABLE
