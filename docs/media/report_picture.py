@@ -24,6 +24,13 @@ WIDTH, HEIGHT = 1200, 800
 """Size of the window of the browser, in px of the page."""
 SCALE = 0.75
 """Size of a px of the page, in px of the picture."""
+SHOWN_SHARE = 1.5 / 9.0
+"""Time at which the picture shows the arms, as a share of the run."""
+MOVE_SLIDER = f"""<script>
+const slider = document.querySelector("#arms input");
+slider.value = Number(slider.min) + {SHOWN_SHARE} * (Number(slider.max) - Number(slider.min));
+slider.dispatchEvent(new Event("input", {{ bubbles: true }}));
+</script>"""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -46,7 +53,10 @@ def write_report(folder: Path) -> Path:
     tn.simulate(SCENARIO).save(log)
     command = [sys.executable, "-m", "trilat_net", "report", "run.mcap"]
     subprocess.run(command, cwd=folder, check=True)
-    return folder / "run" / "report.html"
+    page = folder / "run" / "report.html"
+    text = page.read_text(encoding="utf-8")
+    page.write_text(text.replace("</body>", f"{MOVE_SLIDER}</body>"), encoding="utf-8")
+    return page
 
 
 def draw_page(browser: str, page: Path, picture: Path) -> None:
@@ -66,6 +76,8 @@ def draw_page(browser: str, page: Path, picture: Path) -> None:
             f"--user-data-dir={profile}",
             f"--window-size={WIDTH},{HEIGHT}",
             f"--force-device-scale-factor={SCALE}",
+            # The arms stand still where MOVE_SLIDER puts them, whatever the speed of the machine.
+            "--force-prefers-reduced-motion",
             # The time of the page, in ms, so that scripts have drawn the arms.
             "--virtual-time-budget=5000",
             f"--screenshot={picture.resolve()}",
