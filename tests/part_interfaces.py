@@ -63,7 +63,7 @@ def list_interfaces() -> list[InterfaceRow]:
 
 
 def read_table() -> list[InterfaceRow]:
-    """Returns the rows of the table."""
+    """Returns the names that docs/data/part-interfaces.csv lists, in its order."""
     with TABLE.open(encoding="utf-8", newline="") as file:
         return [InterfaceRow(*(row[key] for key in _HEAD)) for row in csv.DictReader(file)]
 

@@ -116,7 +116,7 @@ def passed_on(alpha: Any, Kd: Any) -> Any:
 
 
 def feasible(alpha: Any, Kd: Any) -> bool:
-    """True if some beta >= 0, not zero, leaves nothing positive."""
+    """True if nonnegative weights beta, not all zero, make every term of V' nonpositive."""
     rows = passed_on(alpha, Kd)
     n = len(alpha)
     solution = linprog(np.zeros(n), rows, np.full(len(rows), 1e-9), np.ones((1, n)), [1.0])

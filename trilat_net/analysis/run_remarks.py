@@ -47,7 +47,10 @@ def list_remarks(log: Log) -> tuple[str, ...]:
 
 
 def _describe_programs(log: Log) -> str:
-    """Returns that the judgement leaves out how programs react. Empty if no program acted."""
+    """Returns a remark that the judgement takes no account of how programs react to the arms.
+
+    It is empty if no program moved an arm.
+    """
     sites = list_program_sites(log)
     if not sites:
         return ""

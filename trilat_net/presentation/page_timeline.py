@@ -139,13 +139,14 @@ def describe_dominance(scenario: Scenario) -> str:
 
 def _list_hands(log: Log) -> Iterator[_RunMoment]:
     """Yields when people and programs took hold of arms or let go, and which ones failed."""
+    failures = log.failed_hands
     for event in log.events:
         if event.kind == "hand":
             yield _RunMoment(
                 max(event.t_ns, 0) * 1e-9,
                 f"{event.text}.",
                 event.member,
-                is_bad=event.text in log.failed_hands,
+                is_bad=event.text in failures,
             )
 
 

@@ -362,13 +362,12 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         # when an arm touches a sampled wall again.
         has_threshold = has_imported_law or _has_sampled_wall(loop.scenario)
         is_proof_possible = not has_threshold or sampled.verdict == "unstable"
-        exact = sampled.is_exact and is_proof_possible
+        # A program that reacts to the arms may make a loop unstable, or stable.
+        exact = sampled.is_exact and is_proof_possible and not loop.programs
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
             last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
             exact = _has_same_sign(sampled, last_roots)
-        # A program that reacts to the arms may make a loop unstable, or stable.
-        exact = exact and not loop.programs
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
         return roots._replace(
             distance_rad=loop.distance_rad,

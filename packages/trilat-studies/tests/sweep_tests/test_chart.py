@@ -13,7 +13,6 @@ from trilat_studies.sweep.stability_map import (
     PlaneAxis,
     StabilityCriterion,
     build_stability_map,
-    compute_borders,
     evaluate_criterion,
     find_criterion_edge,
     load_grid_scenario,
@@ -389,13 +388,13 @@ def test_line_between_few_columns_is_that_of_theory() -> None:
 
 def test_columns_of_a_fine_map_are_not_divided() -> None:
     axis = PlaneAxis("link.delay_ms", tuple(np.arange(0.0, 500.0, 10.0).tolist()), "")
-    columns = refine_columns(axis, compute_borders(axis))
+    columns = refine_columns(axis)
     assert columns.values == axis.values
     assert columns.on_grid == tuple(range(50))
 
 
 def test_fine_columns_contain_those_of_the_map() -> None:
     axis = PlaneAxis("link.delay_ms", (1.0, 10.0, 100.0), "")
-    columns = refine_columns(axis, compute_borders(axis))
+    columns = refine_columns(axis)
     assert [columns.values[n] for n in columns.on_grid] == [1.0, 10.0, 100.0]
     assert [columns.positions[n] for n in columns.on_grid] == [0.0, 1.0, 2.0]

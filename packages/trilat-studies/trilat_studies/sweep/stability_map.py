@@ -773,26 +773,38 @@ class _FineColumns(NamedTuple):
     on_grid: tuple[int, ...]
 
 
-def refine_columns(axis: PlaneAxis, borders: Array) -> _FineColumns:
-    """Divides the intervals between the columns of a map, unless these are many already.
+def _keep_columns(axis: PlaneAxis) -> _FineColumns:
+    """Returns the columns of the map alone, with none between them.
 
     Args:
         axis: Horizontal axis of the map.
-        borders: Borders of the map's cells along the axis, shape (n + 1,) for n values. Lines
-            reach the outer ones if the values are equally spaced.
+    """
+    count = len(axis.values)
+    return _FineColumns(axis.values, tuple(axis.positions.tolist()), tuple(range(count)))
+
+
+def refine_columns(axis: PlaneAxis) -> _FineColumns:
+    """Divides the intervals between the columns of a map, unless these are many already.
+
+    If the values are equally spaced, columns beside the outer ones let lines reach the borders
+    of the map.
+
+    Args:
+        axis: Horizontal axis of the map.
     """
     values = np.array(axis.values)
     positions = axis.positions
     intervals = len(values) - 1
     parts = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
     if intervals < 1 or parts == 1:
-        return _FineColumns(axis.values, tuple(positions.tolist()), tuple(range(len(values))))
+        return _keep_columns(axis)
     indices = np.arange(intervals * parts + 1) / parts
     fine_values = np.interp(indices, np.arange(len(values)), values)
     fine_positions = np.interp(indices, np.arange(len(values)), positions)
     fine_values[::parts] = values
     on_grid = np.arange(len(values)) * parts
     if axis.is_evenly_spaced:
+        borders = compute_borders(axis)
         half = max(1, parts // 2)  # the borders are half a cell away
         before = np.linspace(borders[0], values[0], half, endpoint=False)
         after = np.linspace(borders[-1], values[-1], half, endpoint=False)[::-1]
@@ -1223,13 +1235,13 @@ def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) 
     They are those of the map if the scenario is not valid between them, for example because
     only whole numbers are.
     """
-    fine = refine_columns(x, compute_borders(x))
+    fine = refine_columns(x)
     try:
         for load in loaders:
             for value in fine.values:
                 load(value, y.values[0])
     except ScenarioError:
-        return _FineColumns(x.values, tuple(x.positions.tolist()), tuple(range(len(x.values))))
+        return _keep_columns(x)
     return fine
 
 

@@ -799,8 +799,8 @@ def plan_tuning(
             others.append(load_tuning_scenario(source, texts))
     for space in spaces:
         # a law may refuse the scenario, for example its scheme: before the search, not in it
-        middle = CandidateSearch(space, 1, seed, Objective(objective)).propose_candidates(0)
-        base.with_gains(space, knowledge, middle[0])
+        (gains,) = CandidateSearch(space, 1, seed, Objective(objective)).propose_candidates(0)
+        base.with_gains(space, knowledge, gains)
     return TuningPlan(
         base=base,
         spaces=spaces,
