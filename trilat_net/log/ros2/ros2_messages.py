@@ -32,7 +32,7 @@ from ...scenario.event_text import describe_event
 from ..mcap_writer import McapWriter
 from ..site_log import compute_task_errors
 from . import cdr
-from .robot_model import RobotModel
+from .robot_model import RobotModel, name_ros_joints
 
 EVENTS = "events"
 """Channel of the session's events as plain text."""
@@ -246,9 +246,7 @@ class Ros2SiteChannels:
         self.robot: RobotModel | None = None
         if arm.chain is not None:
             self.robot = RobotModel(scenario, site)
-        self.joints = [*arm.joint_names]
-        if self.robot is None:
-            self.joints = [f"{site}_{name}" for name in arm.joint_names]
+        self.joints = name_ros_joints(scenario, site)
         sent_arrays = _make_sent_arrays(scenario, site)
         self._slow_names = ("tau_x", "theta_hat", *sent_arrays, "mode")
         self.record_arrays = ("error", *self._slow_names)
