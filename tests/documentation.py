@@ -130,6 +130,7 @@ NOT_RUN = {
     "docs/sessions/ros2.md: export RMW": "needs an installation of ROS 2",
     "docs/sessions/two-operators.md: ZENOH_CONFIG_OVERRIDE": "needs an installation of ROS 2",
     "docs/sessions/ros2.md: ros2": "needs an installation of ROS 2",
+    "docs/sessions/ros2.md: import rclpy": "needs an installation of ROS 2",
     "docs/studies/train-policies.md: from stable_baselines3": "needs Stable-Baselines3; done by hand",
     "docs/sessions/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
 }

@@ -146,7 +146,9 @@ def render_table(path: Path) -> str:
         download += f" Here are the first {MOST_ROWS}."
     lines = [heads, ["---"] * len(heads), *rows[:MOST_ROWS]]
     table = "\n".join(f"| {' | '.join(map(escape_cell, line))} |" for line in lines)
-    return f"# {title[:1].upper()}{title[1:]}\n\n{download}\n\n{table}"
+    # Rows of data would stand before the pages that explain them among the results of a search.
+    hidden = "---\nsearch:\n  exclude: true\n---\n"
+    return f"{hidden}\n# {title[:1].upper()}{title[1:]}\n\n{download}\n\n{table}"
 
 
 def escape_cell(text: str) -> str:
