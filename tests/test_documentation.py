@@ -216,6 +216,7 @@ COMMAND_PAGES = {
     "docs/tutorials/lab.md",
     "docs/reference/laws.md",
     "docs/studies/linear.md",
+    "docs/overview.md",
     "docs/reference/metrics.md",
     "docs/reference/silent-peers.md",
     "docs/reference/stability.md",
