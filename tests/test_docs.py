@@ -116,7 +116,6 @@ STATED: list[tuple[str, str, float, float]] = [
         10,
         site_end.LINGER_NS / 1e9,
     ),
-    ("session-protocol.md", "and 2 s more", 2, site_end.LEAVE_TIMEOUT_NS / 1e9),
     ("session-protocol.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("data/zenoh-settings.csv", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
     ("session-protocol.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
@@ -222,8 +221,6 @@ STATED: list[tuple[str, str, float, float]] = [
     ("twins.md", "for 5 s or more", 5, twin_growth.LEAST_LEFT_S),
     ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),
     ("data/sweep-ends.csv", "by more than 2 %", 2, 100 * sweep_cell.FLAT_LOG_CHANGE),
-    ("sweep.md", "in batches of about 2 s", 2, executor.CLUSTER_BATCH_S),
-    ("sweep.md", "0.4 s on this machine", 0.4, executor.BATCH_S),
     (
         "certificate-energy.md",
         "unexplained than 2e-4 of the largest energy",
