@@ -548,6 +548,11 @@ _MAX_VALUE_LENGTH = 80
 """Largest length of the text of a value."""
 
 
+_EVERY_LINK = "every link"
+_SOME_LINKS = "link "
+"""Start of the key of a difference of some links, which their names follow."""
+
+
 class ScenarioDifference(NamedTuple):
     """One key in which several experiments differ, as a row of a comparison.
 
@@ -561,6 +566,11 @@ class ScenarioDifference(NamedTuple):
     key: str
     owners: tuple[str, ...]
     values: tuple[str, ...]
+
+    @property
+    def concerns_link(self) -> bool:
+        """True if the difference is one of links, as in "every link" or "link m1->s"."""
+        return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
         """Returns the key and the sites."""
@@ -636,7 +646,9 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
             names_by_values.setdefault(values, []).append(name)
     differences = []
     for values, names in names_by_values.items():
-        key = "every link" if names == common_names else f"link {', '.join(names)}"
+        key = _SOME_LINKS + ", ".join(names)
+        if names == common_names:
+            key = _EVERY_LINK
         differences.append(ScenarioDifference(key, (), values))
     return differences
 
