@@ -345,8 +345,9 @@ def figure_command(
         width_in: Width of the figures in inches: one or two columns of a paper.
         folder: Folder for the figures; default: the name of FILE with -figures in place of
             .mcap.
-        others: Draw this log together with FILE in one figure, which is named overlay;
-            repeatable.
+        others: Draw this log together with FILE in the same panels, with dashed lines;
+            repeatable. The figures are overlay (largest values of all sites), positions,
+            tracking_errors and control_torques. Their legend names the differing settings.
     """
     log = laws.open(file)
     if listed:
@@ -366,10 +367,6 @@ def figure_command(
 
     settings: dict[str, Any] = {"width_in": width_in, "formats": format_names, "force": force}
     if others:
-        if names:
-            raise UsageError(
-                "--with can draw only the figure overlay: leave out the names of other figures"
-            )
         logs = {file.stem: log}
         logs |= {path.stem: terminal.open_with_progress(path) for path in others}
         if len(logs) <= len(others):
@@ -377,7 +374,7 @@ def figure_command(
             raise UsageError(
                 "logs that are drawn over one another must have different file names"
             )
-        paths = write_overlay(logs, out, **settings)
+        paths = write_overlay(logs, out, names or (), **settings)
     else:
         with terminal.progress_bar("drawing") as progress:
             paths = write_figures(log, out, names or (), progress=progress, **settings)
