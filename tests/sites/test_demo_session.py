@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from numba.core import event
 
 from tests.cli.running import trilat
 from tests.live.processes import is_running
@@ -27,12 +28,12 @@ WAITS = ("record", "--session", "nobody", "--connect", "tcp/127.0.0.1:9", "-o", 
 def test_compilations_are_announced_before_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if loading the scenario has compiled, and announced, a part of the code before."""
     said: list[str] = []
-    compiled = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=site_tick.py_func)})
+    compiled = {"dispatcher": SimpleNamespace(py_func=site_tick.py_func)}
 
     def compile_in_two_parts(_scenario: object, _site: str) -> None:
         for _ in range(2):
-            compiling_notice.on_start(compiled)
-            compiling_notice.on_end(compiled)
+            event.start_event("numba:compile", compiled)
+            event.end_event("numba:compile", compiled)
 
     monkeypatch.setattr(demo_session, "is_core_cached", lambda: False)
     monkeypatch.setattr(demo_session, "warm_up", compile_in_two_parts)
