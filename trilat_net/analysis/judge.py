@@ -92,12 +92,14 @@ def certify_run(
     if twins != 0:
         growth = measure_twins(log, certificate.end, twins, own_laws=own_laws)
     final_scenario = resolve_final_scenario(log)
+    roots = find_log_roots(log, own_laws=own_laws)
+    conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
     return replace(
         certificate,
-        roots=find_log_roots(log, own_laws=own_laws),
+        roots=roots,
         twins=growth,
         law_proofs=tuple(list_law_proofs(final_scenario)),
-        law_conditions=tuple(describe_law_conditions(final_scenario)),
+        law_conditions=tuple(conditions),
         has_lasting_delays=has_lasting_delays(final_scenario),
         remarks=list_remarks(log),
     )

@@ -14,5 +14,6 @@ register_hooks(
         "render a result as HTML": "result_text:render_html",
         "render a site's records as HTML": "site_html:render_site_html",
         "plot a log": "column_plot:plot_log",
+        "head a certificate": "certificate_text:compose_headline",
     },
 )

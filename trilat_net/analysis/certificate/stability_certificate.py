@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.step.vectors import Array
+from ...hooks import find_hook
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
@@ -226,7 +227,11 @@ class Certificate(Result):
         covered = self.verdict.finding is StabilityFinding.COVERED
         all_hold = all(premise.holds is True for premise in self.premises)
         is_proof = covered and all_hold and self.has_lasting_delays
-        theorem = ("the theorem, all of whose premises hold",) if is_proof else ()
+        theorem = (
+            ("the theorem (continuous time; every premise checked here holds)",)
+            if is_proof
+            else ()
+        )
         return (*theorem, *self.law_proofs)
 
     @property
@@ -292,21 +297,10 @@ class Certificate(Result):
     def headline(self) -> str:
         """Returns the judgement and its basis in one line for people.
 
-        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". If the arms
-        exceeded their limits, the line says which joint did so, and when.
+        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". The line is
+        composed by the package `presentation`.
         """
-        if self.end.behaviour is EndBehaviour.DIVERGED:
-            return f"{self.stability}: {self.end.text}"
-        phrase = self.end.phrase
-        # A proof may show a run to be stable whose end alone would be judged otherwise.
-        is_good = self.stability in (Stability.STABLE, Stability.SETTLED)
-        if is_good and self.end.stability is not Stability.SETTLED:
-            phrase = f"{phrase} at the end of the record"
-            if self.end.behaviour is EndBehaviour.UNDECIDED:
-                phrase = "the end of the record shows no trend yet"
-        text = f"{self.stability}: {phrase}"
-        rests_on = self.decision.rests_on
-        return f"{text}; rests on: {rests_on}" if rests_on else text
+        return str(find_hook("head a certificate")(self))
 
     def to_dict(self) -> JsonObject:
         """Returns the certificate as plain values, with the keys of `trilat certify --json`.
@@ -360,7 +354,7 @@ class Certificate(Result):
         A run with a broken energy balance or a changed log is never accepted.
 
         Args:
-            accepted: Further judgements to accept: "settled" for a run that came to rest and
+            accepted: Further judgements to accept: "settled" for a run that slowed down and
                 whose pushes all died away, "bounded" for a bounded oscillation, "open" for a
                 run that cannot be decided.
         """
