@@ -22,7 +22,7 @@ from ..log.log_reader import Log
 from ..scenario import Scenario
 from ..scenario.describe import describe_law_conditions, list_law_situations
 from .certificate.observed_energy import find_energy_laws
-from .certificate.premises import explain_no_functional
+from .certificate.premises import find_missing_functionals
 from .certificate.stability_certificate import Certificate, certify
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability, classify_run_end
@@ -177,5 +177,5 @@ def judge_virtual_run(
 
 def _has_energies(scenario: Scenario) -> bool:
     """Returns True if a run has the energy function V, or energies that its laws declare."""
-    has_functional = not explain_no_functional(scenario)
+    has_functional = not find_missing_functionals(scenario)
     return has_functional or bool(find_energy_laws(scenario, own_laws=True))

@@ -15,5 +15,13 @@ register_hooks(
         "render a site's records as HTML": "site_html:render_site_html",
         "plot a log": "column_plot:plot_log",
         "head a certificate": "certificate_text:compose_headline",
+        "describe a premise": "premise_text:describe_quantities",
+        "describe missing functionals": "premise_text:describe_missing_functionals",
+        "describe closed groups": "premise_text:describe_closed_groups",
+        "describe a verdict": "verdict_text:describe_verdict",
+        "describe a growth of V": "verdict_text:describe_growth",
+        "describe evidence": "verdict_text:describe_evidence",
+        "doubt evidence": "verdict_text:doubt_evidence",
+        "name the theorem": "verdict_text:name_theorem",
     },
 )

@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.certificate import premise_quantities, verdict_facts
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING, ObservedFinding
-from ..analysis.certificate.premises import Premise
-from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
+from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.run_end import EndBehaviour, Stability
 from ..analysis.site_signals import SETTLED_ERROR_RAD
 from ..analysis.stability_decision import LoopRoots
@@ -92,7 +92,7 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         yield TextTable(("energy", "J"), cells, align="lr")
 
 
-def select_premises(certificate: Certificate) -> list[Premise]:
+def select_premises(certificate: Certificate) -> list[premise_quantities.Premise]:
     """Returns the premises that apply to the control laws of a run.
 
     The premises of the stability theorem concern its energy function V. They are left out for
@@ -109,7 +109,7 @@ def select_premises(certificate: Certificate) -> list[Premise]:
     return premises
 
 
-def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
+def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTable:
     """Returns a table with a row per premise: whether it holds, and why."""
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     styles = {"holds": "green", "fails": "yellow"}
@@ -230,7 +230,7 @@ def _explain_judgement(certificate: Certificate) -> str:
     pace = pace or "small disturbances die away"
     if not certificate.has_functional:
         return f"{pace}; the theorem of the paper is about another control law"
-    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+    if certificate.verdict.finding is verdict_facts.StabilityFinding.DID_NOT_RISE:
         return f"{pace}; the theorem of the paper does not apply here and is not needed"
     return pace
 
@@ -273,9 +273,9 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     """Returns the judgement, the verdict about V, and the end of the run."""
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
-    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+    if certificate.verdict.finding is verdict_facts.StabilityFinding.DID_NOT_RISE:
         verdict_mark = "note"  # a theorem that does not apply has neither held nor failed
-    if certificate.verdict.finding is StabilityFinding.BROKEN:
+    if certificate.verdict.finding is verdict_facts.StabilityFinding.BROKEN:
         stability_mark = "FAIL"
         verdict_mark = "FAIL"
     lines = [CertificateLine(stability_mark, describe_judgement(certificate))]
@@ -430,8 +430,8 @@ _JUDGEMENT_MARKS = {
     Stability.OPEN: "open",
 }
 _BALANCE_MARKS = {
-    StabilityFinding.BROKEN: "FAIL",
-    StabilityFinding.NOT_JUDGED: "open",
+    verdict_facts.StabilityFinding.BROKEN: "FAIL",
+    verdict_facts.StabilityFinding.NOT_JUDGED: "open",
 }
 _OBSERVED_MARKS = {
     ObservedFinding.PASSIVE: "ok",
