@@ -10,7 +10,8 @@ The decision combines what is known about a run:
 The words mean:
 
 - Stable: a proof exists for this loop, and the run does not contradict it.
-- Settled: the run came to rest and every push died away, but nothing proves more.
+- Settled: the run became slow or its motion was decaying (`run_end` has the limits), and every
+  push died away, but nothing proves more.
 - Not stable: the run diverged, oscillates, drifts or grows, or its loop has an exact root with
   a positive real part, and no proof says otherwise.
 - Open: everything else.
@@ -350,7 +351,7 @@ def _pushes_excuse_end(run: RunFindings) -> bool:
 
 
 def _has_settled(run: RunFindings) -> bool:
-    """Returns True if a run came to rest and every push died away."""
+    """Returns True if a run became slow, or was decaying, and every push died away."""
     end = run.end
     if not run.has_pushes:
         return False

@@ -175,14 +175,25 @@ def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, 
         yield name, scenario.controls[n], situation
 
 
-def describe_law_conditions(scenario: Scenario) -> list[str]:
+_LOOP_GROWS = ", but the roots of the sampled loop grow"
+"""What is said of a condition that holds if the loop is unstable."""
+_SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
+"""The same of a condition that proves decay in continuous time."""
+
+
+def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> list[str]:
     """Returns lines for the user that say whether the conditions of the stability proofs hold.
 
     Every control law is stable under conditions of its own, for example on its gains and on the
     delays. Sites with the same law and the same condition share a line.
 
+    Most conditions are proved for controllers that act in continuous time. A controller that
+    acts once per tick may be unstable although its condition holds.
+
     Args:
         scenario: Description of the experiment.
+        ticks_grow: True if the loop, computed tick by tick, is known to be unstable. The lines
+            of conditions that hold then say so.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in list_law_situations(scenario):
@@ -190,11 +201,14 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
         if condition:
             owners.setdefault((law.tag, condition), []).append(name)
     verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
-    return [
-        f"condition of {tag} at {', '.join(sites)} {verdicts[condition.holds]}: "
-        f"{condition.text}"
-        for (tag, condition), sites in owners.items()
-    ]
+    lines = []
+    for (tag, condition), sites in owners.items():
+        verdict = verdicts[condition.holds]
+        line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
+        if ticks_grow and condition.holds:
+            line += _SAMPLING_BREAKS if condition.proves_decay else _LOOP_GROWS
+        lines.append(line)
+    return lines
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
