@@ -31,6 +31,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from ..errors import count_nouns
 from .run_end import EndBehaviour, RunEnd, Stability
 from .site_signals import SETTLED_ERROR_RAD
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeTrend
@@ -371,7 +372,8 @@ def _describe_pushes(run: RunFindings) -> str:
     assert run.twins is not None
     pushes = len({growth.push.name for growth in run.twins.pushes})
     duration_s = run.twins.to_s
-    text = f"{pushes} pushes over {duration_s:.4g} s, all of which died away"
+    ending = "all of which died away" if pushes > 1 else "which died away"
+    text = f"{count_nouns(pushes, 'push', 'pushes')} over {duration_s:.4g} s, {ending}"
     roots = run.roots
     if roots is None:
         return text
