@@ -12,7 +12,6 @@ import pytest
 from trilat_people.devices import haply_inverse3, spacemouse
 from trilat_studies.bench import bench_plan, bench_results, bench_run
 from trilat_studies.sweep import (
-    live_confirmation,
     margin_search,
     sweep_cell,
     sweep_plan,
@@ -316,7 +315,6 @@ STATED: list[tuple[str, str, float, float]] = [
     ("replay.md", "sleeps until 150 us before", 150, player.SPIN_NS / 1e3),
     ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
     ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),
-    ("maps/README.md", "took at most 60 s", 60, live_confirmation.MAX_SESSION_S),
     ("felt-forces.md", "at least 4 independent stretches", 4, measured_impedance.MIN_SEGMENTS),
     ("felt-forces.md", "at most 17.2 %", 17.2, math.ceil(1e3 * MOST_RANDOM_ERROR) / 10),
     ("data/metrics.csv", "the same of the last 5 s", 5, motion_metrics.LONG_END_S),

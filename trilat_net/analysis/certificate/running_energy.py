@@ -21,6 +21,7 @@ import numpy as np
 
 from ...core.step.ticks import CoreChange
 from ...core.step.vectors import Array
+from ...hooks import find_hook
 from ...net.messages import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
@@ -44,8 +45,7 @@ from .energy_balance import (
     find_common_times,
     find_dominance_matrices,
 )
-from .premise_text import describe_closed_groups
-from .premises import explain_no_functional
+from .premises import find_missing_functionals
 
 STEP_S = 0.25
 """Shortest span of time over which V is computed in one call, in s."""
@@ -271,7 +271,10 @@ class RunningEnergy:
     """
 
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
-        self.reason = explain_no_functional(scenario)
+        self.reason = ""
+        missing = find_missing_functionals(scenario)
+        if missing:
+            self.reason = str(find_hook("describe missing functionals")(missing))
         rules = [spec.on_stale.rule for spec in scenario.sites.values()]
         degrades = any(rule.degrades for rule in rules)
         if degrades and not self.reason:
@@ -358,7 +361,7 @@ class RunningEnergy:
             if len(groups) > 1:
                 sites = list(energies)
                 names = [[sites[n] for n in group] for group in groups[:2]]
-                self.reason = describe_closed_groups(names)
+                self.reason = str(find_hook("describe closed groups")(names))
                 return None
 
         is_known = len(find_common_times(energies)) > 1

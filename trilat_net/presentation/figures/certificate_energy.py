@@ -26,13 +26,14 @@ from matplotlib.figure import Figure
 
 from ...analysis.certificate.energy_balance import EnergyBalance
 from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
-from ...analysis.certificate.premises import explain_no_functional, find_unjudged_spans
+from ...analysis.certificate.premises import find_unjudged_spans
 from ...analysis.certificate.stability_certificate import Certificate, certify
 from ...core.step.vectors import Array
 from ...log.log_reader import Log
 from ...own_code.code_consent import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
+from ..premise_text import explain_no_functional
 from .figure_entry import draws, unless
 
 _PART_LABELS = {
