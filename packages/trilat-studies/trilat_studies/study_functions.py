@@ -52,6 +52,7 @@ def sweep(
     longest_s: float | None = None,
     judge: str = "verdict",
     metrics: Sequence[str] = (),
+    refine: int = 0,
     out: str | Path | None = None,
     jobs: int | None = None,
     on: "Workers" = None,
@@ -84,6 +85,8 @@ def sweep(
             addition to its verdict.
         metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
             columns of the rows.
+        refine: Number of halvings along the stability edge. The sweep begins with every
+            2^refine-th value of the first two numeric axes. 0 runs all cells.
         out: Folder of the results. A sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
         jobs: Number of processes. None uses one per core.
@@ -107,6 +110,7 @@ def sweep(
         longest_s=longest_s,
         judge=judge,
         metrics=metrics,
+        refine=refine,
     )
     folder = prepare_sweep_folder(plan, None if out is None else Path(out))
     return run_sweep(folder, jobs, on=on).results

@@ -25,9 +25,9 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.presentation.result_text import TextTable
 from trilat_net.scenario import Scenario, parse_scenario
 
+from .result_table import ResultRow
 from .sweep_cell import CellClass, classify_decision
 from .sweep_plan import label_axis
-from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
 """Duration of the longest cell that is confirmed, in s. A live session lasts as long as the
