@@ -80,9 +80,10 @@ def sweep(
         duration_s: First duration of the runs of a cell, in s.
         longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
             By default eight times `duration_s`, or `duration_s` if `judge` is "twins".
-        judge: "verdict" or "twins". Twins are two runs that differ by a small disturbance. With
-            "twins", the exponent with which the disturbance grows is measured in each cell, in
-            addition to its verdict.
+        judge: "verdict", "twins" or "linear". Twins are two runs that differ by a small
+            disturbance. With "twins", the exponent with which the disturbance grows is measured
+            in each cell, in addition to its verdict. With "linear", no run is made: a cell has
+            the growth rate of its linear loop.
         metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
             columns of the rows.
         refine: Number of halvings along the stability edge. The sweep begins with every

@@ -557,7 +557,9 @@ def _find_exponent_limit(plane: MapPlane) -> float:
     The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed it,
     so that a few large exponents do not make all others pale.
     """
-    exponents = [panel.exponents_per_s.ravel() for panel in plane.panels]
+    # The cells that ran in a refined sweep lie along the edge, where exponents are small.
+    panels = map(fill_panel, plane.panels) if plane.halvings else plane.panels
+    exponents = [panel.exponents_per_s.ravel() for panel in panels]
     magnitudes = np.abs(np.concatenate(exponents))
     quantile = float(np.nanquantile(magnitudes, 0.8))
     least = max(quantile, 1e-6)
@@ -789,8 +791,8 @@ def _list_notes(chart: StabilityMap) -> list[str]:
     plane = chart.plane
     if plane.halvings:
         notes.append(
-            f"{describe_refined_cells(plane)}, along the edge; each of the others is drawn "
-            "like the nearest one, and the table has the columns of the coarse grid"
+            f"{describe_refined_cells(plane)}, along the edge; the others are drawn "
+            "like their neighbours, and the table has the columns of the coarse grid"
         )
     if plane.refused:
         refused = count_nouns(plane.refused, "cell")

@@ -763,22 +763,32 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
 
     Checking all cells of a large grid would take too long. The sample has up to
     `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their first
-    values, and the corners of the grid.
+    values, and the corners of the grid. A single combination that is not valid is allowed: the
+    sweep refuses this cell alone.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
         law_index: Index of the law.
 
     Raises:
-        ScenarioError: A cell cannot run, or two values of an axis give the same scenario.
+        ScenarioError: A value cannot run with the first nor with the last values of the other
+            axes, no corner can run, or two values of an axis give the same scenario.
     """
     first_cell = [law_index] + [0] * len(plan.axes)
+    last_cell = [law_index, *(len(axis.texts) - 1 for axis in plan.axes)]
     for dimension, axis in enumerate(plan.axes, 1):
         value_of_digest: dict[str, str] = {}
         for index in spread_indices(len(axis.texts)):
             indices = first_cell.copy()
             indices[dimension] = index
-            digest = _load_cell(plan, indices).sha256
+            try:
+                digest = _load_cell(plan, indices).sha256
+            except ScenarioError as error:
+                others = last_cell.copy()
+                others[dimension] = index
+                if not _is_valid(plan, others):
+                    raise error from None
+                continue
             text = axis.texts[index]
             if digest in value_of_digest:
                 raise ScenarioError(
@@ -791,8 +801,23 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
             value_of_digest[digest] = text
 
     axis_ends = [sorted({0, len(axis.texts) - 1}) for axis in plan.axes]
-    for corner in product([law_index], *axis_ends):
-        _load_cell(plan, corner)
+    corners = list(product([law_index], *axis_ends))
+    if not any(_is_valid(plan, corner) for corner in corners):
+        _load_cell(plan, corners[0])
+
+
+def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
+    """Returns True if a cell is a valid scenario.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        indices: Index of the law and of the value on each axis.
+    """
+    try:
+        _load_cell(plan, indices)
+    except ScenarioError:
+        return False
+    return True
 
 
 def spread_indices(count: int) -> list[int]:
