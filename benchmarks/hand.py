@@ -13,7 +13,7 @@ import numpy as np
 import trilat_net
 from tests.live.processes import HOLDER, PAPER, Session, Stage, connections
 from tests.sites.devices import HaplyService
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.connection import resolve_member_connection

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.life.own_hand import HandProgram, HandView
-from trilat_net.core.plug.user_law import PeerView
+from trilat_net.core import HandProgram, HandView, PeerView
 from trilat_net.errors import (
     RunFailed,
     SessionError,
@@ -29,19 +28,20 @@ from trilat_net.errors import (
     count_nouns,
     describe_exception,
 )
-from trilat_net.net import topics
-from trilat_net.net.arm_client import SiteClient, make_hand_sender
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection, open_bus
-from trilat_net.net.membership import read_messages
-from trilat_net.net.requests import HandMessage, HandViewMessage
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.program_hand import (
-    HandSite,
-    find_own_hand,
-    make_hand_program,
+from trilat_net.net import (
+    Bus,
+    Clock,
+    Connection,
+    HandMessage,
+    HandViewMessage,
+    SiteClient,
+    SystemClock,
+    make_hand_sender,
+    open_bus,
+    read_messages,
+    topics,
 )
+from trilat_net.scenario import HandSite, Scenario, find_own_hand, make_hand_program
 from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000

@@ -76,7 +76,16 @@ def _module_names(path: Path) -> dict[str, Place | Path | ast.expr]:
             names[node.targets[0].id] = node.value
         elif isinstance(node, ast.ImportFrom) and node.level:
             base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+            package = ".".join(base.relative_to(house.ROOT).parts)
+            homes = house.interface_homes(package) if package in house.INTERFACES else {}
             for alias in node.names:
+                if alias.name in homes:
+                    home = house.find_file((*package.split("."), *homes[alias.name].split(".")))
+                    if home is not None:
+                        is_module = home.stem == alias.name
+                        place = home if is_module else Place(home, alias.name)
+                        names[alias.asname or alias.name] = place
+                    continue
                 inside = (base / alias.name).with_suffix(".py")
                 module = base.with_suffix(".py")
                 if module.is_file() or inside.is_file():

@@ -30,7 +30,7 @@ from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, LifeOrder, Mode, TickInput
 from trilat_net.core.step.vectors import Array
 from trilat_net.execution.resumption import read_output
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS

@@ -11,7 +11,7 @@ from tests.virtual_runs import sampled, trajectories
 from trilat_net.core.life.session_life import MIN_ALIGN_NS
 from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, parse_scenario
 

@@ -16,8 +16,8 @@ from tests.log_surgery import Pieces, Stored, repacked, taken_apart
 from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.running_digest import DigestState

@@ -15,10 +15,10 @@ from trilat_net.analysis.torque_sources import compute_live_torque, split_torque
 from trilat_net.core.life.live_hand import HandCommand, HandMemory, advance_hand
 from trilat_net.core.step.site_step import Site
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 

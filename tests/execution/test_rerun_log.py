@@ -9,9 +9,9 @@ import pytest
 from tests.log_editing import opened, recorded
 from trilat_net.errors import UsageError
 from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.messages import VERSION
 

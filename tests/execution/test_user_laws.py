@@ -12,7 +12,7 @@ from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.errors import LawFailed, ScenarioError, UsageError, join_arguments
 from trilat_net.execution import virtual
 from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.own_code.code_consent import find_user_laws

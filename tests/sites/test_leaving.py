@@ -11,7 +11,7 @@ from trilat_net.analysis.certificate.stability_certificate import StabilityFindi
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.session_check import check_file

@@ -10,7 +10,7 @@ from sites.hand_process import HandProcess
 from tests.own_code import Circle, Failing, Follower
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus

@@ -22,15 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.life.live_hand import TAKEN
-from ..core.links.dominance import find_reach, perron_vector
-from ..core.step.ticks import DominanceRamp
-from ..core.step.vectors import Array
+from ..core import TAKEN, Array, DominanceRamp, find_reach, perron_vector
 from ..errors import UsageError
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..scenario import Scenario
-from ..scenario.operators.program_hand import POLICY, ProgramHand
+from ..log import Ints, Log
+from ..scenario import POLICY, ProgramHand, Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
 """Half of the nanosecond to which the starts and ends of ramps are rounded, in s."""

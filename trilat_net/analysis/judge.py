@@ -15,12 +15,9 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..execution.fused import FusedRun
-from ..execution.virtual import simulate_scenario
-from ..log.accounting import MIN_COVERAGE
-from ..log.log_reader import Log
-from ..scenario import Scenario
-from ..scenario.describe import describe_law_conditions, list_law_situations
+from ..execution import FusedRun, simulate_scenario
+from ..log import MIN_COVERAGE, Log
+from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import explain_no_functional
 from .certificate.stability_certificate import Certificate, certify

@@ -30,13 +30,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
-from ..core.links.dominance import find_reach
-from ..core.step.ticks import BUCKETS_PER_S
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
+from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, TorqueKind, find_reach
+from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
 from .site_signals import SETTLED_ERROR_RAD, find_last_error

@@ -18,11 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
-from ..scenario.expect import END_WINDOW_S
+from ..core import Array
+from ..log import Ints, Log, SiteLog
+from ..scenario import END_WINDOW_S
 
 SETTLED_ERROR_RAD = 1e-2
 """Largest error of a settled site, in rad for joints and in m for axes of end effectors."""

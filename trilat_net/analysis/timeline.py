@@ -17,17 +17,18 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..core.life.session_life import HELD_OVERRUN_TICKS
-from ..core.step.ticks import find_alarm
+from ..core import HELD_OVERRUN_TICKS, find_alarm
 from ..errors import count_nouns
-from ..log.log_reader import Log
-from ..log.site_log import SiteLog
-from ..net.messages import MODES, ModeMeaning
-from ..scenario import find_owner
-from ..scenario.delay_models import LinkBase
-from ..scenario.event_text import describe_event
-from ..scenario.run_changes import describe_change, find_requester
-from ..scenario.scenario_types import Change
+from ..log import Log, SiteLog
+from ..net import MODES, ModeMeaning
+from ..scenario import (
+    Change,
+    LinkBase,
+    describe_change,
+    describe_event,
+    find_owner,
+    find_requester,
+)
 
 
 def list_effective_commands(log: Log) -> list[Change]:

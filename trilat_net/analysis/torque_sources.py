@@ -19,17 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arms.exogenous import (
-    LIVE_KINDS,
-    OWN_KINDS,
-    SCRIPTED_KINDS,
-    TorqueKind,
-    TorqueSource,
-)
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..scenario import Scenario, SiteSpec
-from ..scenario.operators import ActorBase
+from ..core import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
+from ..log import Log
+from ..scenario import ActorBase, Scenario, SiteSpec
 from .aligned import AlignedRecords, Bools, align_records
 from .arm_rows import EndEffectorRows, build_arm_rows
 

@@ -34,10 +34,7 @@ from typing import Any
 from rich.console import Console
 from setproctitle import setproctitle
 
-from sites.machine_load import check_machine_load
-from sites.site_parts import warm_up
-from trilat_net.core.step.jit import compiling_notice, is_core_cached
-from trilat_net.core.step.ticks import NS_PER_S
+from sites import check_machine_load, warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import (
@@ -47,18 +44,17 @@ from trilat_net.files import (
     make_subfolder,
     write_whole,
 )
-from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import reserve_session_endpoints
-from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.program_hand import find_own_hand
-from trilat_net.scenario.validate import check_outside_arms
 from trilat_net.signals import Interrupt
 
+from ..core import compiling_notice, is_core_cached
+from ..log import Log, open_log
+from ..net import Clock, SystemClock, ZenohBus, reserve_session_endpoints
+from ..own_code import list_imported_code
+from ..records import NS_PER_S
+from ..scenario import check_outside_arms, find_own_hand
 from .monitor import SessionDisplay, SessionMonitor
 
 POLL_NS = 100_000_000

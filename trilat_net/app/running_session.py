@@ -26,25 +26,32 @@ from typing import Any
 from trilat_net.entry_points import HOOKS, load_entry
 from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
 from trilat_net.net import topics
-from trilat_net.net.arm_client import Hand
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection
-from trilat_net.net.discovery import (
+from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
+
+from ..net import (
+    OPERATOR,
     REPLY_TIMEOUT_S,
+    Bus,
+    ChangeReply,
+    ChangeRequest,
+    Clock,
+    Connection,
+    Event,
+    Hand,
+    Info,
+    OrderName,
+    State,
+    SystemClock,
     connect_to_session,
     find_members,
     list_past_events,
+    read_messages,
+    read_records,
+    resolve_member_connection,
+    secure_connection,
     send_change,
 )
-from trilat_net.net.membership import read_messages, read_records
-from trilat_net.net.messages import Event, Info, State
-from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
-from trilat_net.net.zenoh_config import OPERATOR
-from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
-from trilat_net.scenario.run_changes import parse_core_change
-from trilat_net.scenario.sample_uses import PictureDelay
-
+from ..scenario import PictureDelay, parse_core_change
 from .input_device import Device
 from .session_ping import PingReport, ping_session
 

@@ -26,34 +26,41 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.exogenous import LIVE_KINDS
-from ..core.links.delay import max_delay_us
-from ..core.plug.compiled_law import CompiledLaw, plug_law
-from ..core.plug.law_view import PlainLaw
-from ..core.step.fused_run import (
+from ..core import (
+    BUCKETS_PER_S,
+    LIVE_KINDS,
+    MAX_ARRIVALS,
     NEVER_NS,
     PROGRESS_DTYPE,
+    Array,
+    CompiledLaw,
+    CoreChange,
+    IntArray,
     LawArrays,
+    PlainLaw,
     RecentRecords,
     ReplayedInputs,
+    Row,
+    RowArray,
+    SiteArrays,
+    SiteSetup,
+    apply_change,
     finish_site,
+    max_delay_us,
     max_over_joints,
+    plug_law,
     run_until,
+    select_site,
     sense_site,
+    stack_site_arrays,
     sums_dtype,
+    tick_ns,
 )
-from ..core.step.site_arrays import SiteArrays, apply_change, select_site, stack_site_arrays
-from ..core.step.site_setup import SiteSetup
-from ..core.step.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
-from ..core.step.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError, count_nouns
-from ..log.log_reader import Log
-from ..own_code.code_consent import find_user_laws
-from ..scenario import Scenario
-from ..scenario.operators.kernel_operators import Wall
-from ..scenario.operators.program_hand import make_hand_players
-from ..scenario.plant_player import PlantPlayer
-from ..scenario.validate import refuse_external_arms
+from ..log import Log
+from ..own_code import find_user_laws
+from ..records import NS_PER_S, Mode
+from ..scenario import PlantPlayer, Scenario, Wall, make_hand_players, refuse_external_arms
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:

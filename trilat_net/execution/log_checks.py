@@ -18,13 +18,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..errors import ScenarioError, count_nouns, join_arguments
-from ..log.accounting import MIN_COVERAGE, describe_unknown_ends
-from ..log.findings import CheckReport, Finding
-from ..log.log_reader import Log, open_log
-from ..log.mcap_reader import Progress
-from ..own_code.code_consent import find_user_laws
-from ..own_code.imported_code import CodeConsents, allowed_code
-from .verify import VerifyResult, verify
+from ..log import (
+    MIN_COVERAGE,
+    CheckReport,
+    Finding,
+    Log,
+    Progress,
+    describe_unknown_ends,
+    open_log,
+)
+from ..own_code import CodeConsents, allowed_code, find_user_laws
+from .verification import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 _MAX_GAPS_NAMED = 60

@@ -25,12 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.step.site_setup import Law
-from ..core.step.ticks import BUCKETS_PER_S, NS_PER_S
-from ..core.step.vectors import Array
+from ..core import BUCKETS_PER_S, Array, Law
 from ..errors import NotRepeatable, UsageError, count_nouns
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
+from ..log import Ints, Log
+from ..records import NS_PER_S
 from ..scenario import Scenario
 from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 

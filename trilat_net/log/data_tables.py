@@ -32,14 +32,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.chain import LINK_PARAMETERS
-from ..core.arms.task_space import POSE, POSITION
+from ..core import LINK_PARAMETERS, POSE, POSITION
 from ..errors import LogError
 from ..files import import_extra
-from ..net.messages import Event, LinkStats, State, json_schema
+from ..net import Event, LinkStats, State, json_schema
 from ..records import NS_PER_S
-from ..scenario import Scenario
-from ..scenario.arms import TASK_AXES, ArmModel
+from ..scenario import TASK_AXES, ArmModel, Scenario
 from .orientations import QUATERNION_AXES, align_signs, compute_quaternions
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages

@@ -24,8 +24,7 @@ from typing import IO, Any
 
 from ..errors import LogRefused, UsageError, count_nouns
 from ..files import describe_write_error, publish_file, refuse_existing, sync_folder
-from ..net import topics
-from ..net.clock import SystemClock
+from ..net import SystemClock, topics
 from .log_layout import active_path
 from .mcap_records import MAGIC
 

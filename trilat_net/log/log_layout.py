@@ -19,9 +19,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import UsageError
-from ..net import topics
-from ..net.bus import matches_key
-from ..net.messages import Event, LinkStats, RecorderStats, State
+from ..net import Event, LinkStats, RecorderStats, State, matches_key, topics
 
 ACTIVE_SUFFIX = ".active"
 """Suffix of a log's file name while the log is being recorded."""

@@ -22,8 +22,7 @@ from typing import Any, Protocol
 
 from ..errors import LogRefused, UsageError
 from ..files import refuse_existing
-from ..net import topics
-from ..net.messages import VERSION, Event, LinkStats, State, json_schema
+from ..net import VERSION, Event, LinkStats, State, json_schema, topics
 from ..records import TickRecord
 from . import log_layout
 from .log_file import LogFile

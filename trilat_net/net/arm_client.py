@@ -33,9 +33,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
 
-from ..core.arms.exogenous import TorqueKind, TorqueSource
-from ..core.life.live_hand import GRIP_NS, SILENCE_NS, HandInForce
-from ..core.step.ticks import LifeReason
+from ..core import GRIP_NS, SILENCE_NS, HandInForce, LifeReason, TorqueKind, TorqueSource
 from ..errors import UsageError, WireError
 from . import topics
 from .bus import Bus

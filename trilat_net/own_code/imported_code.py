@@ -30,11 +30,10 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast, runtime
 
 from msgspec import Meta, field
 
-from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
+from ..core import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
-from ..laws.interface import LawSettings, check_law_class
-from ..laws.sent_vectors import SentVectorSpecs, convert_sends
+from ..laws import LawSettings, SentVectorSpecs, check_law_class, convert_sends
 from .class_arguments import make_own_instance
 from .sent_channel import parse_classes
 

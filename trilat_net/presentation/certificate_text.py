@@ -19,15 +19,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
-from ..analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING, ObservedFinding
-from ..analysis.certificate.premises import Premise
-from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
-from ..analysis.run_end import EndBehaviour, Stability
-from ..analysis.stability_decision import LoopRoots
-from ..analysis.twins.envelope_trend import EnvelopeTrend
-from ..analysis.twins.twin_growth import PushedTwins, TwinGrowth
-from ..core.step.vectors import Array
+from ..analysis import (
+    NEGATIVE_ENERGY_MEANING,
+    ZERO_ENERGY_J,
+    Certificate,
+    EndBehaviour,
+    EnergyBalance,
+    EnvelopeTrend,
+    LoopRoots,
+    ObservedFinding,
+    Premise,
+    PushedTwins,
+    Stability,
+    StabilityFinding,
+    TwinGrowth,
+)
+from ..core import Array
 from ..errors import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 

@@ -23,9 +23,16 @@ that they do not know.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..log.ros2.cdr import FLOAT64_ARRAY, POSE, STRING
-from ..log.ros2.robot_model import SPACING_M, WORLD
-from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD, Ros2Channel, is_robot_description
+from ..log import (
+    FLOAT64_ARRAY,
+    NUMBERS_BY_MODE_WORD,
+    POSE,
+    SPACING_M,
+    STRING,
+    WORLD,
+    Ros2Channel,
+    is_robot_description,
+)
 from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 
 _MODE = "mode"

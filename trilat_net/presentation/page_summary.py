@@ -18,22 +18,23 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.metrics.motion_metrics import measure_undelayed_error
-from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
-from ..analysis.run_view import RunView
-from ..analysis.site_signals import (
+from ..analysis import (
+    FORCE_NM,
     SETTLED_ERROR_RAD,
+    Certificate,
+    EndBehaviour,
     JointError,
+    RunView,
+    Stability,
     find_error_of_last_second,
     find_largest_error,
+    list_alarms,
+    measure_undelayed_error,
 )
-from ..analysis.timeline import list_alarms
 from ..errors import count_nouns, join_words
-from ..log.findings import Finding
-from ..log.log_reader import Log
+from ..log import Finding, Log
 from ..results import JsonObject
-from ..scenario.expect import END_WINDOW_S
+from ..scenario import END_WINDOW_S
 from .certificate_text import describe_pace
 from .html_templates import render_macro
 from .page_html import NO_NUMBER, format_cell, render_details

@@ -14,12 +14,17 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-from ..log.log_layout import VIZ_ROOT
-from ..log.log_reader import open_log
-from ..log.ros2.published import list_full_topics
-from ..log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
-from ..log.ros2.rviz_config import build_rviz_config
-from ..log.ros2.topic_names import NAMINGS, make_session_name, read_topic_table
+from ..log import (
+    NAMINGS,
+    VIZ_ROOT,
+    Ros2Channel,
+    build_rviz_config,
+    list_full_topics,
+    make_session_name,
+    open_log,
+    read_ros2_channels,
+    read_topic_table,
+)
 from .foxglove_layout import build_foxglove_layout
 from .rerun_viewer import build_plot_layout
 

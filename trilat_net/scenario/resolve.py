@@ -32,13 +32,11 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 import numpy as np
 
-from ..core.arms.two_link_arm import ArmLinks
-from ..core.links import dominance
+from ..core import ArmLinks, find_row_problem
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import Frozen, TomlTable, reword_problem, split_refusal
 from ..files import open_regular
-from ..own_code.imported_code import CLASS_PATTERN, read_code
-from ..own_code.sent_channel import parse_classes, read_sends
+from ..own_code import CLASS_PATTERN, parse_classes, read_code, read_sends
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
@@ -915,7 +913,7 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 
     factors = {name: float(row.get(name, 0.0)) for name in names}
     row_vector = np.array(list(factors.values()))
-    problem = dominance.find_row_problem(row_vector, names.index(site))
+    problem = find_row_problem(row_vector, names.index(site))
     if problem:
         raise ScenarioError(problem, path=path)
     del factors[site]

@@ -21,8 +21,7 @@ import tomli_w
 
 from ..errors import ScenarioError, suggest_nearest
 from ..files import open_regular
-from ..own_code.code_consent import allow_own_code
-from ..own_code.imported_code import name_law_classes
+from ..own_code import allow_own_code, name_law_classes
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
 from .resolve import SHIPPED_FOLDER, resolve_scenario
 from .scenario_types import Scenario, SiteSpec

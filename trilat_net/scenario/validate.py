@@ -21,14 +21,12 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from ..core.links.dominance import is_irreducible
-from ..core.step.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
+from ..core import MAX_LINKS_BYTES, is_irreducible, links_bytes, needed_pages
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
-from ..laws.interface import LawSettings
-from ..own_code.imported_code import ImportedLaw
-from ..own_code.sent_channel import check_sends
+from ..laws import LawSettings
+from ..own_code import ImportedLaw, check_sends
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .delay_models import LinkBase

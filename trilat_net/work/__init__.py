@@ -1,1 +1,70 @@
 """Work in many runs: processes that share it, folders that keep it, and intervals."""
+
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # Worker processes
+    "MAX_LOSSES",
+    "Progress",
+    "WorkerPool",
+    "Workers",
+    "check_workers",
+    "count_workers",
+    "ignore_progress",
+    "open_worker_pool",
+    # Folders of studies
+    "RunJournal",
+    "StudyFolder",
+    "build_resume_hint",
+    "describe_program",
+    "encode_csv",
+    "format_command",
+    "format_toml_value",
+    "list_assignments",
+    "set_options",
+    # Intervals of confidence
+    "MeanInterval",
+    "mean_interval",
+    "wilson_interval",
+]
+
+if TYPE_CHECKING:
+    from .executor import (
+        MAX_LOSSES,
+        Progress,
+        WorkerPool,
+        Workers,
+        check_workers,
+        count_workers,
+        ignore_progress,
+        open_worker_pool,
+    )
+    from .intervals import MeanInterval, mean_interval, wilson_interval
+    from .study_folder import (
+        RunJournal,
+        StudyFolder,
+        build_resume_hint,
+        describe_program,
+        encode_csv,
+        format_command,
+        format_toml_value,
+        list_assignments,
+        set_options,
+    )
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "executor": (
+                "MAX_LOSSES Progress WorkerPool Workers check_workers count_workers "
+                "ignore_progress open_worker_pool"
+            ),
+            "intervals": "MeanInterval mean_interval wilson_interval",
+            "study_folder": (
+                "RunJournal StudyFolder build_resume_hint describe_program encode_csv "
+                "format_command format_toml_value list_assignments set_options"
+            ),
+        },
+    )

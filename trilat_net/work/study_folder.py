@@ -24,12 +24,12 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import msgspec
 import tomli_w
 
-from ..core.step.fingerprint import compute_fingerprint
+from ..core import compute_fingerprint
 from ..errors import ScenarioError, join_arguments
 from ..files import describe_write_error, extend_file
-from ..log.provenance import collect_provenance
-from ..own_code.imported_code import name_law_classes
-from ..scenario.key_checks import is_distribution
+from ..log import collect_provenance
+from ..own_code import name_law_classes
+from ..scenario import is_distribution
 from .executor import Progress, Together, WorkerPool
 
 

@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import value
+from trilat_net.app import options, value
 from trilat_net.errors import UsageError
-from trilat_net.net.clock import SystemClock
+from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
 from trilat_net.signals import Interrupt
 
@@ -48,12 +47,9 @@ def ros2_command(
             robots.
         rviz: Write a configuration of RViz that shows the arms of the session.
     """
-    from trilat_net.app.running_session import RunningSession
-    from trilat_net.log.ros2.topic_names import read_topic_table
-    from trilat_net.net.host_names import check_hosts
-    from trilat_net.net.ros2_graph import DISTROS, Refusals, Ros2Graph
-    from trilat_net.net.ros2_names import check_ros_name
-    from trilat_net.net.zenoh_config import BRIDGE
+    from trilat_net.app import RunningSession
+    from trilat_net.log import read_topic_table
+    from trilat_net.net import BRIDGE, DISTROS, Refusals, Ros2Graph, check_hosts, check_ros_name
 
     from .ros2_bridge import serve_ros2
 

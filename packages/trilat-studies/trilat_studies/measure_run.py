@@ -25,32 +25,38 @@ import msgspec
 import numpy as np
 
 from trilat_net import process
-from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.metrics.log_metrics import find_quantity, measure_run
-from trilat_net.analysis.metrics.measures import Metric
-from trilat_net.analysis.run_end import (
+from trilat_net.analysis import (
     NO_BUCKETS,
+    Metric,
     RunEnd,
     RunTrace,
     Stability,
+    build_arm_rows,
     classify_run_end,
+    find_quantity,
+    list_walls,
+    measure_run,
     reduce_to_buckets,
+    wall_force,
 )
-from trilat_net.analysis.torque_sources import list_walls, wall_force
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
-from trilat_net.core.step.vectors import Array
-from trilat_net.execution import virtual
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.virtual import simulate_scenario
-from trilat_net.execution.virtual_comparison import find_absent_samples
+from trilat_net.core import BUCKETS_PER_S, Array, Site
+from trilat_net.execution import (
+    FusedRun,
+    execute_virtual,
+    find_absent_samples,
+    simulate_scenario,
+)
 from trilat_net.fields import split_unit
-from trilat_net.log.log_reader import Log
-from trilat_net.log.record_columns import Ints
-from trilat_net.log.site_log import compute_task_errors
-from trilat_net.scenario import Expect, Scenario
-from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
-from trilat_net.scenario.key_checks import field_names
+from trilat_net.log import Ints, Log, compute_task_errors
+from trilat_net.records import NS_PER_S, Mode, TickRecord
+from trilat_net.scenario import (
+    ALL_SITES_QUANTITIES,
+    END_WINDOW_S,
+    Expect,
+    ExpectWindow,
+    Scenario,
+    field_names,
+)
 
 BATCH_RECORDS = 1000
 """Number of records of a site in a batch."""
@@ -226,7 +232,7 @@ def run_in_batches(
         records.clear()
 
     with process.pause_gc():
-        for site, _, output in virtual.execute_virtual(scenario):
+        for site, _, output in execute_virtual(scenario):
             sites[site.name] = site
             site_records = pending[site.name]
             site_records.append(output)

@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import flag, value
-from trilat_net.app.cli.run_progress import run_in_own_folder, show_progress
+from trilat_net.app import flag, options, run_in_own_folder, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
 from trilat_net.presentation import terminal_output as terminal
 
@@ -78,7 +76,7 @@ def _draw_map(
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler that computes the map instead.
     """
-    from trilat_net.presentation.appearance import COLUMN_IN, make_print_size
+    from trilat_net.presentation import COLUMN_IN, make_print_size
 
     from .sweep.fixed_gains import FAIR_COMPARISON
     from .sweep.map_page import write_map
@@ -208,7 +206,7 @@ def _run_sweep(
     Returns:
         The finished sweep.
     """
-    from trilat_net.work.executor import count_workers
+    from trilat_net.work import count_workers
 
     from .sweep import sweep_results, sweep_run
 

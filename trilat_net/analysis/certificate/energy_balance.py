@@ -26,9 +26,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ...core.step.site_setup import Scheme
-from ...core.step.vectors import Array
-from ...log.log_reader import Log
+from ...core import Array, Scheme
+from ...log import Log
 from ...scenario import Scenario
 from ..aligned import (
     AlignedRecords,

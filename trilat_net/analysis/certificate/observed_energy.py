@@ -22,14 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
-from ...core.step.site_setup import Scheme, StaleAction
-from ...core.step.vectors import Array
+from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction, sum_work
 from ...errors import count_nouns
-from ...log.log_reader import Log
-from ...own_code.imported_code import ImportedLaw
+from ...log import Log
+from ...own_code import ImportedLaw
 from ...results import JsonObject
-from ...scenario.scenario_types import Scenario
+from ...scenario import Scenario
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premise_quantities import BookedTorqueQuantities, BooksQuantities, SamplingQuantities

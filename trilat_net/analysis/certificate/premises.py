@@ -27,11 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...log.accounting import Coverage
-from ...log.log_reader import Log
-from ...log.running_digest import Integrity
-from ...log.session_check import judge_integrity
-from ...net.messages import HALTED_MODES
+from ...log import Coverage, Integrity, Log, judge_integrity
+from ...net import HALTED_MODES
 from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited_rows

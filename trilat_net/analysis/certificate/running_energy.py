@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.step.ticks import CoreChange
-from ...core.step.vectors import Array
-from ...net.messages import RESTING_MODES, TASK_VECTORS, State
+from ...core import Array, CoreChange
+from ...net import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
     RECORD_COLUMNS,

@@ -29,9 +29,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.step.vectors import Array
-from ...log.accounting import MIN_COVERAGE
-from ...log.log_reader import Log
+from ...core import Array
+from ...log import MIN_COVERAGE, Log
 from ...results import JsonObject, Result, finite_or_none
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
 from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability

@@ -18,14 +18,11 @@ from contextlib import suppress
 import msgspec
 import numpy as np
 
-from ...core.step.site_setup import Law, SiteSetup
-from ...core.step.ticks import BUCKETS_PER_S
-from ...core.step.vectors import Array
+from ...core import BUCKETS_PER_S, Array, Law, SiteSetup
 from ...errors import ScenarioError, UsageError, count_nouns
-from ...execution.fused import FusedRun
-from ...own_code.imported_code import ImportedLaw
-from ...scenario import Scenario
-from ...scenario.operators.kernel_operators import Chirp, Multisine
+from ...execution import FusedRun
+from ...own_code import ImportedLaw
+from ...scenario import Chirp, Multisine, Scenario
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop
 from .characteristic_roots import limit_blas_threads

@@ -26,16 +26,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.step.vectors import Array
+from ...core import Array
 from ...errors import ScenarioError, UsageError
-from ...execution.fused import FusedRun
-from ...log.log_reader import Log
+from ...execution import FusedRun
+from ...log import Log
 from ...results import Result
-from ...scenario import Scenario, load_scenario
-from ...scenario.describe import (
+from ...scenario import (
     IRREVERSIBLE_SHARES,
+    Scenario,
     describe_law_conditions,
     lacks_detailed_balance,
+    load_scenario,
 )
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum

@@ -24,9 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ...core.arms.exogenous import TorqueKind
-from ...core.step.site_setup import Law
-from ...core.step.vectors import Array
+from ...core import Array, Law, TorqueKind
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, load_scenario
 from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum

@@ -23,26 +23,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.arms.exogenous import (
+from ...core import (
     LIVE_KINDS,
     OWN_KINDS,
     SCRIPTED_KINDS,
+    Array,
+    DelayKind,
+    Gains,
+    Scheme,
+    SiteSetup,
+    StaleAction,
     TorqueKind,
     TorqueSource,
+    link_key,
 )
-from ...core.links.delay import DelayKind
-from ...core.links.philox import link_key
-from ...core.step.site_setup import Gains, Scheme, SiteSetup, StaleAction
-from ...core.step.ticks import NS_PER_S
-from ...core.step.vectors import Array
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
-from ...laws.conditions import LinearForm, LinearSituation
-from ...own_code.imported_code import ImportedLaw
-from ...scenario import Scenario
-from ...scenario.delay_models import LinkBase
-from ...scenario.sample_uses import draw_used_samples
-from ...scenario.validate import refuse_external_arms
+from ...laws import LinearForm, LinearSituation
+from ...own_code import ImportedLaw
+from ...records import NS_PER_S
+from ...scenario import LinkBase, Scenario, draw_used_samples, refuse_external_arms
 from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,

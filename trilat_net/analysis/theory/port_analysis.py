@@ -31,14 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 
-from ...core.arms.exogenous import TorqueKind, TorqueSource
-from ...core.arms.task_space import POSITION
-from ...core.step.site_setup import Law, SiteSetup
-from ...core.step.vectors import Array
+from ...core import POSITION, Array, Law, SiteSetup, TorqueKind, TorqueSource
 from ...errors import UsageError, count_nouns
 from ...results import finite_or_none
-from ...scenario import Scenario
-from ...scenario.arms import TASK_AXES
+from ...scenario import TASK_AXES, Scenario
 from ..arm_rows import build_arm_rows
 from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response

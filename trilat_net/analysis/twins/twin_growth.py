@@ -29,12 +29,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.arms.exogenous import TorqueKind
-from ...core.links.delay import DelayKind
-from ...core.step.ticks import BUCKETS_PER_S
-from ...core.step.vectors import Array
+from ...core import BUCKETS_PER_S, Array, DelayKind, TorqueKind
 from ...errors import NotRepeatable, UsageError, count_nouns
-from ...execution.twins import (
+from ...execution import (
     LEAST_PUSH,
     MOST_PUSH,
     PUSH_RAD,
@@ -47,7 +44,7 @@ from ...execution.twins import (
     run_twins,
     run_virtual_twins,
 )
-from ...log.log_reader import Log, open_log
+from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
 from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link

@@ -24,20 +24,22 @@ import msgspec
 from trilat_net import process
 from trilat_net.errors import LogError, ScenarioError, UsageError, count_nouns
 from trilat_net.files import reading
-from trilat_net.log.log_layout import (
+from trilat_net.net import topics
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Scenario, parse_embedded
+
+from ...log import (
     ALL_CHANNELS,
     SCENARIO,
     SESSION,
     SITE_CHANNELS,
     ChannelFilter,
+    McapMessage,
+    McapReader,
+    Progress,
     parse_channel_filter,
 )
-from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
-from trilat_net.net import topics
-from trilat_net.net.topics import number_message
-from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, parse_embedded
-
+from ...net import number_message
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 
 PlayTime = Literal["publish", "log"]

@@ -22,13 +22,11 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from ...core.arms.task_space import POSITION
+from ...core import POSITION
 from ...files import reading
-from ...net.messages import MODE_WORDS, Event, LinkStats, State
+from ...net import MODE_WORDS, Event, LinkStats, State
 from ...records import Mode, TickRecord
-from ...scenario import Scenario
-from ...scenario.arms import TASK_AXES
-from ...scenario.event_text import describe_event
+from ...scenario import TASK_AXES, Scenario, describe_event
 from ..mcap_writer import McapWriter
 from ..site_log import compute_task_errors
 from . import cdr

@@ -21,7 +21,7 @@ import msgspec
 
 from ...errors import UsageError, suggest_nearest
 from ...files import open_regular
-from ...net.ros2_names import check_ros_name
+from ...net import check_ros_name
 
 NAMINGS = ("crisp", "crtk")
 """The two built-in conventions: CRISP, and the Collaborative Robotics Toolkit (CRTK)."""
@@ -56,7 +56,7 @@ TOPICS = {
 CRISP is a set of ROS 2 controllers. CRTK is the convention of the da Vinci Research Kit. A
 vector that a control law sends has the same name in both: "sent_" and the name of the vector.
 """
-FRAMES = "tf"
+FRAMES_TOPIC = "tf"
 """Topic with the poses of all links, under the name that tools of ROS expect."""
 DIAGNOSTICS = "diagnostics"
 """Topic with the status of all sites, under the name that tools of ROS expect."""

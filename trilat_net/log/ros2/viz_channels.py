@@ -21,8 +21,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 
-from ...net import topics
-from ...net.messages import Event, LinkStats
+from ...net import Event, LinkStats, topics
 from ...records import NS_PER_S
 from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT

@@ -8,8 +8,7 @@ in the folder describe the columns and contain the scenario.
 import io
 from pathlib import Path
 
-from ...log.data_tables import Table, to_data_frame
-from ...log.log_reader import Log
+from ...log import Log, Table, to_data_frame
 from ..export import ExportFormat, Written, write_table_files
 
 

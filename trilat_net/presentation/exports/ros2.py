@@ -19,22 +19,25 @@ from pathlib import Path
 
 import numpy as np
 
-from ...analysis.dominance_history import trace_dominance
-from ...core.step.ticks import NS_PER_S
-from ...log.log_layout import SCENARIO
-from ...log.log_reader import Log
-from ...log.mcap_writer import McapWriter
-from ...log.provenance import collect_provenance
-from ...log.ros2 import cdr, ros2_messages
-from ...log.ros2.published import SiteMessages, list_full_topics, pack_session_diagnostics
-from ...log.ros2.topic_names import (
+from ...analysis import trace_dominance
+from ...log import (
     DIAGNOSTICS,
-    FRAMES,
+    FRAMES_TOPIC,
     NAMINGS,
+    SCENARIO,
+    Log,
+    McapWriter,
+    SiteMessages,
     TopicTable,
+    cdr,
+    collect_provenance,
+    list_full_topics,
     make_session_name,
+    pack_session_diagnostics,
     read_topic_table,
+    ros2_messages,
 )
+from ...records import NS_PER_S
 from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
@@ -197,7 +200,7 @@ class _SiteBag:
                 description = (topic, self._messages.description)
                 messages.insert(0, description)
             for data in self._messages.pack_frames(record):
-                messages.append((FRAMES, data))
+                messages.append((FRAMES_TOPIC, data))
             yield log_ns[row], publish_ns[row], messages
             is_last = count == len(records)
             if is_last or count % _RECORDS_PER_REPORT == 0:

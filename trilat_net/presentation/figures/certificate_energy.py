@@ -24,13 +24,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis.certificate.energy_balance import EnergyBalance
-from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
-from ...analysis.certificate.premises import explain_no_functional, find_unjudged_spans
-from ...analysis.certificate.stability_certificate import Certificate, certify
-from ...core.step.vectors import Array
-from ...log.log_reader import Log
-from ...own_code.code_consent import may_run_user_laws
+from ...analysis import (
+    Certificate,
+    EnergyBalance,
+    ObservedEnergy,
+    certify,
+    explain_no_functional,
+    find_unjudged_spans,
+    observe_energies,
+)
+from ...core import Array
+from ...log import Log
+from ...own_code import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless

@@ -20,11 +20,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ...analysis.twins.twin_growth import PushedTwins, TwinGrowth
+from ...analysis import PushedTwins, TwinGrowth
 from ...errors import UsageError, suggest_nearest
 from ...files import make_folder, refuse_existing
-from ...log.log_reader import Log, open_log
-from ...log.mcap_reader import Progress
+from ...log import Log, Progress, open_log
 from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
 from .figure_entry import FigureEntry, list_figures

@@ -19,21 +19,27 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 from msgspec import Meta, field
 
 from ... import fields
-from ...core.life.own_hand import HandContext, HandProgram, HandView, OwnHand
-from ...core.step.site_arrays import SiteArrays
-from ...core.step.site_step import Site
-from ...core.step.ticks import NS_PER_S, tick_ns
-from ...core.step.vectors import Array
+from ...core import (
+    Array,
+    HandContext,
+    HandProgram,
+    HandView,
+    OwnHand,
+    Site,
+    SiteArrays,
+    tick_ns,
+)
 from ...errors import describe_exception
-from ...own_code.class_arguments import make_own_instance
-from ...own_code.imported_code import (
+from ...own_code import (
     CLASS_PATTERN,
     CodeKey,
     Watch,
     call_directly,
     import_class,
+    make_own_instance,
     read_code,
 )
+from ...records import NS_PER_S
 from . import HeldArm
 from .kernel_operators import LiveHand
 

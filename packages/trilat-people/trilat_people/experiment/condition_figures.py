@@ -20,8 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from trilat_net.fields import split_unit
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
+from trilat_net.presentation import COLUMN_IN, SITE_COLOURS, make_print_size, style
 
 from .completion_times import COMPLETION, find_median, find_unit_medians, summarise_times
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions

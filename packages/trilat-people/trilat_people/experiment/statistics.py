@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.fields import split_unit
 from trilat_net.files import import_extra
-from trilat_net.work.intervals import mean_interval, wilson_interval
+from trilat_net.work import mean_interval, wilson_interval
 
 Row = Mapping[str, Any]
 """A trial: its participant, pair and condition, and its measures by name."""

@@ -37,12 +37,19 @@ import msgspec
 from msgspec import Meta
 
 from trilat_net.errors import WireError
-from trilat_net.net import topics
-from trilat_net.net.arm_client import SiteSender, make_hand_sender
-from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.clock import Clock
-from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
-from trilat_net.net.wire import decode, encode
+from trilat_net.net import (
+    Bus,
+    ChangeReply,
+    ChangeRequest,
+    Clock,
+    HandMessage,
+    Inbox,
+    SiteSender,
+    decode,
+    encode,
+    make_hand_sender,
+    topics,
+)
 
 MAX_MESSAGE_BYTES = 4_096
 """Largest size of a page's message."""

@@ -52,7 +52,7 @@ from trilat_net.log.ros2.published import list_topics
 from trilat_net.log.ros2.robot_model import RobotModel
 from trilat_net.log.ros2.topic_names import (
     DIAGNOSTICS,
-    FRAMES,
+    FRAMES_TOPIC,
     TOPICS,
     RobotTable,
     read_topic_table,
@@ -211,7 +211,7 @@ def test_the_table_of_topics_is_complete() -> None:
         rows = list(csv.DictReader(file))
     listed = {name.rpartition("/")[2] for row in rows for name in row["topic"].split(", ")}
     accepted = {name for name in TOPICS if name.startswith(("target_", "set_", "robot_"))}
-    published = set(TOPICS) - accepted | {"robot_description", FRAMES, DIAGNOSTICS}
+    published = set(TOPICS) - accepted | {"robot_description", FRAMES_TOPIC, DIAGNOSTICS}
     assert listed == published | {"events", "log", "sent_..."}
 
 

@@ -21,13 +21,11 @@ from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from trilat_net.analysis.run_end import Stability
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import Stability
+from trilat_net.core import Array
 from trilat_net.files import write_whole
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import make_print_size
-from trilat_net.work.intervals import MeanInterval
-from trilat_net.work.study_folder import encode_csv
+from trilat_net.presentation import make_print_size, style
+from trilat_net.work import MeanInterval, encode_csv
 
 from .bench_results import (
     BenchCellResult,

@@ -27,26 +27,35 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
-from trilat_net.analysis.judge import judge_virtual_run
-from trilat_net.analysis.run_end import THROWN_RAD, EndBehaviour, RunEnd, Stability
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
-from trilat_net.analysis.stability_decision import LoopRoots
-from trilat_net.analysis.torque_sources import list_walls, wall_force
-from trilat_net.analysis.twins.twin_growth import TwinGrowth
-from trilat_net.core.step.ticks import NS_PER_S
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import (
+    SETTLED_ERROR_RAD,
+    THROWN_RAD,
+    EndBehaviour,
+    LoopRoots,
+    RunEnd,
+    Stability,
+    TwinGrowth,
+    build_arm_rows,
+    evaluate_ramps,
+    judge_virtual_run,
+    list_scripted_ramps,
+    list_walls,
+    wall_force,
+)
+from trilat_net.core import Array
 from trilat_net.errors import UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.kernel_operators import ViscousEnvironment
-from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
-from trilat_net.work.study_folder import (
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Scenario, ViscousEnvironment
+from trilat_net.work import (
+    Progress,
     RunJournal,
     StudyFolder,
+    Workers,
     build_resume_hint,
     describe_program,
+    ignore_progress,
+    open_worker_pool,
 )
 
 from ..measure_run import RecordBatch, run_whole

@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis.run_end import EndBehaviour, classify_log_end
+from trilat_net.analysis import EndBehaviour, classify_log_end
 from trilat_net.errors import LogError, UsageError
-from trilat_net.log.log_reader import open_log
-from trilat_net.presentation.result_text import TextTable
+from trilat_net.log import open_log
+from trilat_net.presentation import TextTable
 from trilat_net.scenario import Scenario, parse_scenario
 
 from .sweep_cell import CellClass, classify_decision

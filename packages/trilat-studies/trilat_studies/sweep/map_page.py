@@ -38,11 +38,9 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.files import write_whole
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import COLUMN_IN, FigureSize, make_print_size
-from trilat_net.presentation.result_text import TextTable
+from trilat_net.presentation import COLUMN_IN, FigureSize, TextTable, make_print_size, style
 
 from .fixed_gains import FAIR_COMPARISON
 from .stability_map import (

@@ -21,18 +21,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis.judge import judge_virtual_run
-from trilat_net.analysis.run_end import EndBehaviour, RunTrace, Stability, classify_run_end
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
-from trilat_net.analysis.theory.loop_roots import find_run_roots
-from trilat_net.analysis.twins.twin_growth import measure_virtual_twins
-from trilat_net.execution.fused import FusedRun, RunTotals, check_fusable
+from trilat_net.analysis import (
+    SETTLED_ERROR_RAD,
+    EndBehaviour,
+    RunTrace,
+    Stability,
+    classify_run_end,
+    find_run_roots,
+    judge_virtual_run,
+    measure_virtual_twins,
+)
+from trilat_net.execution import FusedRun, RunTotals, check_fusable
 from trilat_net.results import finite_or_none
-from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.validate import refuse_live_only
+from trilat_net.scenario import Scenario, parse_scenario, refuse_live_only
 
 if TYPE_CHECKING:
-    from trilat_net.execution.lanes import RunGroup
+    from trilat_net.execution import RunGroup
 
 
 class CellClass(StrEnum):
@@ -281,7 +285,7 @@ def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCe
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution.lanes import group_runs
+    from trilat_net.execution import group_runs
 
     cells = [_CellInProgress(parse_scenario(text), longest_s) for text in texts]
     runs = [cell.run for cell in cells]

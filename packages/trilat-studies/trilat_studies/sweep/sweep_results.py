@@ -28,14 +28,20 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis.metrics.log_metrics import find_quantity
+from trilat_net.analysis import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
-from trilat_net.execution.fused import RunTotals
+from trilat_net.execution import RunTotals
 from trilat_net.files import write_whole
 from trilat_net.results import Result
-from trilat_net.scenario.scenario_reader import read_source
-from trilat_net.work.intervals import MeanInterval, mean_interval, wilson_interval
-from trilat_net.work.study_folder import encode_csv, format_command, set_options
+from trilat_net.scenario import read_source
+from trilat_net.work import (
+    MeanInterval,
+    encode_csv,
+    format_command,
+    mean_interval,
+    set_options,
+    wilson_interval,
+)
 
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan, plan_from_json

@@ -44,28 +44,35 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.dominance_history import (
+from trilat_net.analysis import (
+    SETTLED_ERROR_RAD,
+    EndBehaviour,
+    RunEnd,
+    Stability,
+    build_arm_rows,
+    compute_target_motion,
     evaluate_ramps,
     find_closed_groups,
+    find_hanging_sites,
     left_perron_vector,
     list_scripted_ramps,
 )
-from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
-from trilat_net.analysis.torque_sources import compute_target_motion
-from trilat_net.core.step.ticks import NS_PER_S
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import ScenarioError
-from trilat_net.laws.interface import LawSettings, TuningRun
-from trilat_net.log.log_reader import Log
-from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.expect import END_WINDOW_S
-from trilat_net.scenario.operators.kernel_operators import JointSpring, Wall
-from trilat_net.scenario.scenario_reader import ExperimentText, read_experiment
-from trilat_net.scenario.validate import refuse_live_only
-from trilat_net.work.intervals import mean_interval
-from trilat_net.work.study_folder import format_command, format_toml_value, set_options
+from trilat_net.laws import LawSettings, TuningRun
+from trilat_net.log import Log
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import (
+    END_WINDOW_S,
+    ExperimentText,
+    JointSpring,
+    Scenario,
+    Wall,
+    parse_scenario,
+    read_experiment,
+    refuse_live_only,
+)
+from trilat_net.work import format_command, format_toml_value, mean_interval, set_options
 
 from ..measure_run import RecordBatch, run_whole
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls

@@ -20,19 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from ..analysis.judge import certify_run
-from ..analysis.site_signals import find_error_of_last_second
+from ..analysis import certify_run, find_error_of_last_second
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
-from ..execution.log_checks import check_log_files
-from ..execution.virtual_comparison import simulate_without_operators
-from ..log.accounting import MIN_COVERAGE
-from ..log.findings import CheckReport, Finding
-from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from ..log.site_log import SiteLog
-from ..own_code.code_consent import may_run_user_laws
-from ..own_code.imported_code import allowed_code
-from ..scenario.expect import END_WINDOW_S
+from ..execution import check_log_files, simulate_without_operators
+from ..log import MIN_COVERAGE, CheckReport, Finding, Log, Progress, SiteLog
+from ..own_code import allowed_code, may_run_user_laws
+from ..scenario import END_WINDOW_S
 from ..workers import worker_pool
 from . import terminal_output
 from .certificate_text import (
