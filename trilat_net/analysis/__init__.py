@@ -118,7 +118,6 @@ __all__ = [
     "DelayDistribution",
     "FileOverview",
     "StatedModel",
-    "evaluate_ramps",
     "find_closed_groups",
     "find_mode_intervals",
     "find_program",
@@ -131,9 +130,9 @@ __all__ = [
     "list_alarms",
     "list_changes",
     "list_ramps",
-    "list_scripted_ramps",
     "list_stated_models",
     "measure_delay_distributions",
+    "plan_dominance",
     "recorded_end_s",
     "sample_ages_ns",
     "summarise_run",
@@ -162,14 +161,13 @@ if TYPE_CHECKING:
     from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
     from .certificate.stability_certificate import Certificate, StabilityFinding, certify
     from .dominance_history import (
-        evaluate_ramps,
         find_closed_groups,
         find_program,
         find_user_shares,
         find_users,
         left_perron_vector,
         list_ramps,
-        list_scripted_ramps,
+        plan_dominance,
         trace_dominance,
     )
     from .file_overview import FileOverview, info, summarise_run
@@ -274,8 +272,8 @@ else:
             "certificate.running_energy": "EnergyCourse KEPT_S RecordWindow RunningEnergy",
             "certificate.stability_certificate": "Certificate StabilityFinding certify",
             "dominance_history": (
-                "evaluate_ramps find_closed_groups find_program find_user_shares find_users "
-                "left_perron_vector list_ramps list_scripted_ramps trace_dominance"
+                "find_closed_groups find_program find_user_shares find_users "
+                "left_perron_vector list_ramps plan_dominance trace_dominance"
             ),
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",

@@ -437,6 +437,22 @@ def evaluate_ramps(
     return DominanceHistory(alpha, rate, at_period_ends)
 
 
+def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
+    """Returns the dominance factors of a site over time, as the scenario plans them.
+
+    Args:
+        scenario: The description of the experiment.
+        site: Name of the site.
+        t_s: Ascending times, shape (K,), in s.
+
+    Returns:
+        Factors with which the site follows its P peers, shape (K, P).
+    """
+    start, ramps = list_scripted_ramps(scenario, site)
+    period_s = 1.0 / scenario.sites[site].rate_hz
+    return evaluate_ramps(start, ramps, t_s, period_s).alpha
+
+
 KD_SHAPE_TOLERANCE = 1e-9
 """Largest relative difference of two gains that count as equal."""
 

@@ -16,7 +16,7 @@ from ..analysis import Certificate, LogMetrics, compute_log_metrics
 from ..entry_points import find_viewer
 from ..errors import UsageError
 from ..execution import LogCheckReport, SimulatedLog, run_log_checks, simulate_scenario
-from ..files import choose_report_folder, make_results_folder
+from ..files import make_results_folder
 from ..log import MIN_COVERAGE, Log, open_log, open_logs
 from ..scenario import Scenario, load_scenario
 
@@ -195,6 +195,15 @@ def metrics(log: AnyLog) -> LogMetrics:
         LogError: The log cannot be read.
     """
     return compute_log_metrics(_open(log))
+
+
+def choose_report_folder(log: Path) -> Path:
+    """Returns the default folder of a log's report, which is named after the log.
+
+    Args:
+        log: File of the log. If its name has no suffix, the folder ends in "-report".
+    """
+    return log.with_suffix("") if log.suffix else log.with_name(f"{log.name}-report")
 
 
 def report(

@@ -29,7 +29,7 @@ from functools import partial
 from itertools import chain
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rich.console import Console
 from setproctitle import setproctitle
@@ -37,19 +37,14 @@ from setproctitle import setproctitle
 from sites import check_machine_load, warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import (
-    create_file,
-    find_page,
-    make_results_folder,
-    make_subfolder,
-    write_whole,
-)
+from trilat_net.files import find_page, make_results_folder, make_subfolder, write_whole
 from trilat_net.net import topics
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.signals import Interrupt
 
 from ..core import compiling_notice, is_core_cached
+from ..files import refuse_link
 from ..log import Log, open_log
 from ..net import Clock, SystemClock, ZenohBus, reserve_session_endpoints
 from ..own_code import list_imported_code
@@ -150,6 +145,21 @@ class SessionProcess:
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last_line = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
         return f"{self.name} ended with code {code}: {last_line}"
+
+
+def create_file(path: Path) -> BinaryIO:
+    """Creates a file for writing without a buffer. An earlier file of that name is deleted.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        UsageError: The path is a symbolic link.
+        OSError: The file cannot be made.
+    """
+    refuse_link(path)
+    path.unlink(missing_ok=True)
+    return path.open("xb", buffering=0)
 
 
 class ProcessStarter:

@@ -181,7 +181,6 @@ __all__ = [
     "find_delay_us",
     "find_due_ns",
     "find_reach",
-    "find_row_problem",
     "is_irreducible",
     "link_dtype",
     "link_key",
@@ -331,7 +330,6 @@ if TYPE_CHECKING:
         ROW_SUM_TOLERANCE,
         find_balancing_weights,
         find_reach,
-        find_row_problem,
         is_irreducible,
         perron_vector,
         update_reference,
@@ -511,7 +509,7 @@ else:
             ),
             "links.dominance": (
                 "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
-                "find_row_problem is_irreducible perron_vector update_reference"
+                "is_irreducible perron_vector update_reference"
             ),
             "links.link": (
                 "AHEAD_LIMIT_NS ChannelArrays LinkArrays accept_sample link_dtype "

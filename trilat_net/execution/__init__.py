@@ -39,10 +39,6 @@ __all__ = [
     "Push",
     "TwinPath",
     "Twins",
-    "choose_pushes",
-    "parse_push",
-    "run_twins",
-    "run_virtual_twins",
 ]
 
 if TYPE_CHECKING:
@@ -50,19 +46,7 @@ if TYPE_CHECKING:
     from .lanes.run_groups import LEAST_RUNS, RunGroup, group_runs
     from .log_checks import LogCheckReport, check_log_files, run_log_checks
     from .rerun_execution import describe_rerun_changes
-    from .twins import (
-        LEAST_PUSH,
-        MOST_PUSH,
-        PUSH_RAD,
-        SMALLEST,
-        Push,
-        TwinPath,
-        Twins,
-        choose_pushes,
-        parse_push,
-        run_twins,
-        run_virtual_twins,
-    )
+    from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .verification import verify
     from .virtual import (
         SimulatedLog,
@@ -81,10 +65,7 @@ else:
             "lanes.run_groups": "LEAST_RUNS RunGroup group_runs",
             "log_checks": "LogCheckReport check_log_files run_log_checks",
             "rerun_execution": "describe_rerun_changes",
-            "twins": (
-                "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins choose_pushes "
-                "parse_push run_twins run_virtual_twins"
-            ),
+            "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "verification": "verify",
             "virtual": (
                 "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"

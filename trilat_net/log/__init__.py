@@ -29,6 +29,7 @@ __all__ = [
     "shift_progress",
     "to_data_frame",
     # Writing a log
+    "FULL_RATE_HZ",
     "VIZ_HZ",
     "LogParts",
     "LogStorage",
@@ -39,8 +40,6 @@ __all__ = [
     "Sink",
     "collect_provenance",
     "compute_virtual_boot",
-    "parse_split",
-    "parse_viz_rate",
     # Names in a log
     "ACTIVE_SUFFIX",
     "ALL_CHANNELS",
@@ -147,7 +146,7 @@ if TYPE_CHECKING:
     )
     from .log_reader import Log, open_log, open_logs, read_link_delays
     from .log_signature import check_signatures, create_signing_keys, sign_log
-    from .log_writer import LogParts, LogStorage, LogWriter, MakeViews, parse_split
+    from .log_writer import LogParts, LogStorage, LogWriter, MakeViews
     from .mcap_reader import (
         ChannelInfo,
         McapMessage,
@@ -208,7 +207,7 @@ if TYPE_CHECKING:
     from .session_check import LogCheckResult, check_file, judge_integrity
     from .session_scenario import SessionScenario
     from .site_log import LazyRecords, RecordsByTick, SiteLog, compute_task_errors
-    from .view_rates import VIZ_HZ, parse_viz_rate
+    from .view_rates import FULL_RATE_HZ, VIZ_HZ
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -224,7 +223,7 @@ else:
             ),
             "log_reader": "Log open_log open_logs read_link_delays",
             "log_signature": "check_signatures create_signing_keys sign_log",
-            "log_writer": "LogParts LogStorage LogWriter MakeViews parse_split",
+            "log_writer": "LogParts LogStorage LogWriter MakeViews",
             "mcap_reader": (
                 "ChannelInfo McapMessage McapReader Progress read_contents shift_progress"
             ),
@@ -259,7 +258,7 @@ else:
             "session_check": "LogCheckResult check_file judge_integrity",
             "session_scenario": "SessionScenario",
             "site_log": "LazyRecords RecordsByTick SiteLog compute_task_errors",
-            "view_rates": "VIZ_HZ parse_viz_rate",
+            "view_rates": "FULL_RATE_HZ VIZ_HZ",
         },
     )
 

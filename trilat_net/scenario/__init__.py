@@ -36,7 +36,6 @@ __all__ = [
     "read_source",
     "read_template",
     "refuse_external_arms",
-    "refuse_live_only",
     "reseed_scenario",
     "split_assignment",
     "write_simulated_options",
@@ -189,12 +188,7 @@ if TYPE_CHECKING:
     from .scenario_types import Change, Limits, Scenario, SiteSpec, scheduled_links
     from .simulated_arm import SimulatedArm
     from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
-    from .validate import (
-        check_outside_arms,
-        refuse_external_arms,
-        refuse_live_only,
-        write_simulated_options,
-    )
+    from .validate import check_outside_arms, refuse_external_arms, write_simulated_options
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -237,9 +231,6 @@ else:
             "scenario_types": "Change Limits Scenario SiteSpec scheduled_links",
             "simulated_arm": "SimulatedArm",
             "skeletons": "name_skeleton_class new_hand new_law new_plant",
-            "validate": (
-                "check_outside_arms refuse_external_arms refuse_live_only "
-                "write_simulated_options"
-            ),
+            "validate": "check_outside_arms refuse_external_arms write_simulated_options",
         },
     )

@@ -149,31 +149,6 @@ def check_outside_arms(scenario: Scenario) -> None:
             )
 
 
-def refuse_live_only(scenario: Scenario) -> None:
-    """Refuses a scenario that only a live session can run.
-
-    A live session has a real network, and may have real robots.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Raises:
-        ScenarioError: An arm is external, or a link has the model "measured": it injects no
-            delay: the real network decides. In virtual time there is no real network.
-    """
-    refuse_external_arms(scenario)
-    if scenario.measured:
-        measured_links = [name for name, link in scenario.links.items() if link.measured]
-        path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
-        raise ScenarioError(
-            "is 'measured', the delay of a real network: a scenario with such a link can only "
-            "run live; to run the scenario here, set another model, as in link.model=constant "
-            "and link.delay_ms=50",
-            path=path,
-            source=scenario.name,
-        )
-
-
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:
     """Refuses a control law that its site cannot carry out.
 

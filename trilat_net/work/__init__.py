@@ -18,12 +18,7 @@ __all__ = [
     "RunJournal",
     "StudyFolder",
     "build_resume_hint",
-    "describe_program",
     "encode_csv",
-    "format_command",
-    "format_toml_value",
-    "list_assignments",
-    "set_options",
     # Intervals of confidence
     "MeanInterval",
     "mean_interval",
@@ -42,17 +37,7 @@ if TYPE_CHECKING:
         open_worker_pool,
     )
     from .intervals import MeanInterval, mean_interval, wilson_interval
-    from .study_folder import (
-        RunJournal,
-        StudyFolder,
-        build_resume_hint,
-        describe_program,
-        encode_csv,
-        format_command,
-        format_toml_value,
-        list_assignments,
-        set_options,
-    )
+    from .study_folder import RunJournal, StudyFolder, build_resume_hint, encode_csv
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -62,9 +47,6 @@ else:
                 "ignore_progress open_worker_pool"
             ),
             "intervals": "MeanInterval mean_interval wilson_interval",
-            "study_folder": (
-                "RunJournal StudyFolder build_resume_hint describe_program encode_csv "
-                "format_command format_toml_value list_assignments set_options"
-            ),
+            "study_folder": "RunJournal StudyFolder build_resume_hint encode_csv",
         },
     )

@@ -39,7 +39,8 @@ from trilat_net.analysis import (
     reduce_to_buckets,
     wall_force,
 )
-from trilat_net.core import BUCKETS_PER_S, Array, Site
+from trilat_net.core import BUCKETS_PER_S, Array, Site, compute_fingerprint
+from trilat_net.errors import ScenarioError
 from trilat_net.execution import (
     FusedRun,
     execute_virtual,
@@ -47,7 +48,7 @@ from trilat_net.execution import (
     simulate_scenario,
 )
 from trilat_net.fields import split_unit
-from trilat_net.log import Ints, Log, compute_task_errors
+from trilat_net.log import Ints, Log, collect_provenance, compute_task_errors
 from trilat_net.records import NS_PER_S, Mode, TickRecord
 from trilat_net.scenario import (
     ALL_SITES_QUANTITIES,
@@ -56,6 +57,7 @@ from trilat_net.scenario import (
     ExpectWindow,
     Scenario,
     field_names,
+    refuse_external_arms,
 )
 
 BATCH_RECORDS = 1000
@@ -1219,3 +1221,46 @@ def _compare_with_range(
         margin=distance / half_width if half_width else None,
         value=measured.most if is_single_value else None,
     )
+
+
+# Packages that compute the results, by their keys in the provenance of a log.
+_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
+
+
+def describe_program() -> tuple[str, dict[str, str]]:
+    """Returns the properties of this program and machine on which numerical results depend.
+
+    Results of a study are mixed only if these properties are the same.
+
+    Returns:
+        A fingerprint of how the machine rounds floating point numbers; and the versions of the
+        program and of the packages that compute the results.
+    """
+    provenance = collect_provenance()
+    versions = {name: provenance[name] for name in _VERSIONS}
+    return compute_fingerprint(), versions
+
+
+def refuse_live_only(scenario: Scenario) -> None:
+    """Refuses a scenario that only a live session can run.
+
+    A live session has a real network, and may have real robots.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Raises:
+        ScenarioError: An arm is external, or a link has the model "measured": it injects no
+            delay: the real network decides. In virtual time there is no real network.
+    """
+    refuse_external_arms(scenario)
+    if scenario.measured:
+        measured_links = [name for name, link in scenario.links.items() if link.measured]
+        path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
+        raise ScenarioError(
+            "is 'measured', the delay of a real network: a scenario with such a link can only "
+            "run live; to run the scenario here, set another model, as in link.model=constant "
+            "and link.delay_ms=50",
+            path=path,
+            source=scenario.name,
+        )

@@ -585,11 +585,12 @@ def bench_command(
         output: Folder for the results; a suite that the folder already contains is continued.
             Default: runs/bench-STUDY.
     """
-    from trilat_net.work import check_workers, format_command
+    from trilat_net.work import check_workers
 
     from .bench import plan_bench, prepare_bench_folder
     from .bench.bench_figures import write_bench
     from .bench.bench_plan import find_stale
+    from .run_commands import format_command
 
     check_workers(jobs, on)
     chosen_study = "small" if small else study

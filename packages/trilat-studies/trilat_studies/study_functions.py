@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trilat_net.app import AnyScenario, Overrides
-from trilat_net.work import list_assignments
+
+from .run_commands import list_assignments
 
 if TYPE_CHECKING:
     from trilat_net.work import Workers

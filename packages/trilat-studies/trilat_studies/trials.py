@@ -58,11 +58,8 @@ from trilat_net.work import (
     MeanInterval,
     WorkerPool,
     Workers,
-    format_command,
-    list_assignments,
     mean_interval,
     open_worker_pool,
-    set_options,
 )
 
 from .measure_run import (
@@ -72,6 +69,7 @@ from .measure_run import (
     measure_log,
     measure_virtual_run,
 )
+from .run_commands import format_command, list_assignments, set_options
 
 
 class TrialResult(NamedTuple):

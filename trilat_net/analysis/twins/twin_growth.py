@@ -39,10 +39,6 @@ from ...execution import (
     Push,
     TwinPath,
     Twins,
-    choose_pushes,
-    parse_push,
-    run_twins,
-    run_virtual_twins,
 )
 from ...log import Log, open_log
 from ...results import Result, finite_or_none
@@ -395,7 +391,7 @@ def measure_twins(
         LogError: A record cannot be read.
     """
     try:
-        twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
+        twins = Twins.of_log(log, Push.choose(log.scenario, count), own_laws=own_laws)
     except NotRepeatable as error:
         return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
     return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
@@ -421,7 +417,7 @@ def measure_virtual_twins(
     Raises:
         ScenarioError: The scenario cannot run in virtual time.
     """
-    twins = run_virtual_twins(scenario, choose_pushes(scenario, count), duration_s)
+    twins = Twins.of_scenario(scenario, Push.choose(scenario, count), duration_s)
     return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
@@ -919,21 +915,19 @@ def twin(
         target, _ = next(iter(targets), ("q", 0.0))
         sizes = _parse_sizes(delta)
         pushes = [
-            parse_push(scenario, target, size, at_s)._replace(largest=math.inf)
+            Push.parse(scenario, target, size, at_s)._replace(largest=math.inf)
             for size in sizes
         ]
     elif targets:
-        pushes = [parse_push(scenario, target, size, at_s) for target, size in targets]
+        pushes = [Push.parse(scenario, target, size, at_s) for target, size in targets]
     elif is_of_certificate:
-        pushes = choose_pushes(scenario)
+        pushes = Push.choose(scenario)
         end = classify_log_end(log)
         counts_from_s = end.counts_from_s
         quiet_from_s = end.quiet_from_s
     else:
-        pushes = [
-            default._replace(at_s=at_s, again=False) for default in choose_pushes(scenario)
-        ]
-    twins = run_twins(log, pushes, own_laws=True)
+        pushes = [default._replace(at_s=at_s, again=False) for default in Push.choose(scenario)]
+    twins = Twins.of_log(log, pushes, own_laws=True)
     growth = judge_twins(scenario, twins, counts_from_s, quiet_from_s)
     linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
     return PushedTwins(log, at_s, growth, linear)

@@ -293,13 +293,9 @@ def _open_page(files: list[Path]) -> None:
     import webbrowser
     from contextlib import suppress
 
-    from ...files import (
-        choose_report_folder,
-        format_extra_install,
-        make_results_folder,
-        refuse_link,
-    )
+    from ...files import format_extra_install, make_results_folder, refuse_link
     from ...presentation import conclude
+    from ..api import choose_report_folder
 
     terminal.print_note(
         f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"

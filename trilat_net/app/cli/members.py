@@ -181,16 +181,10 @@ def record_command(
     from sites import check_machine_load
 
     from ...files import refuse_existing
-    from ...log import (
-        LogStorage,
-        collect_provenance,
-        find_parts,
-        parse_channel_filter,
-        parse_split,
-        parse_viz_rate,
-    )
+    from ...log import LogStorage, collect_provenance, find_parts, parse_channel_filter
     from ...net import RECORDER
     from ..recorded_session import make_scenario_reader
+    from .options import parse_viz_rate
 
     options.check_session_name(session)
     connection = ways.resolve().require(RECORDER)
@@ -695,3 +689,25 @@ def router_command(
 def _print_router_line(text: str) -> None:
     """Prints a line that starts with "router:"."""
     terminal.print_line(f"router: {text}")
+
+
+def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
+    """Parses an option of a command that limits the parts of a log.
+
+    Args:
+        option: Name of the option, for the error message.
+        unit: Name of the option's unit, for the error message.
+        number: Value of the option. None if the option is absent.
+        scale: Bytes or ns per unit.
+
+    Returns:
+        The limit in bytes or ns. None if the option is absent.
+
+    Raises:
+        UsageError: The number is not from 1 to 1e6.
+    """
+    if number is None:
+        return None
+    if not 1.0 <= number <= 1e6:
+        raise UsageError(f"{option} must be a number of {unit} from 1 to 1e6, not {number:g}")
+    return int(number * scale)

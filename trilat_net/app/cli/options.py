@@ -7,6 +7,7 @@ A command that has a parameter of such a type accepts all options of the type
 """
 
 import inspect
+import math
 import re
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import typer
 
 from ...errors import TrilatError, UsageError
+from ...log import FULL_RATE_HZ
 from ...presentation import terminal_output as terminal
 
 if TYPE_CHECKING:
@@ -751,3 +753,30 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
         parameter.name: parameter.annotation for parameter in parameters
     }
     return run_with_tuples
+
+
+def parse_viz_rate(text: str) -> float:
+    """Parses the option `--views`, the rate of the messages for viewers such as Foxglove.
+
+    Args:
+        text: A number from 1 to 1e6, "off" or "full".
+
+    Returns:
+        The rate in Hz. It is 0 for "off" and `FULL_RATE_HZ` for "full".
+
+    Raises:
+        UsageError: The text is neither a number in range nor one of these words.
+    """
+    keywords = {"off": 0.0, "full": FULL_RATE_HZ}
+    if text in keywords:
+        return keywords[text]
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = math.nan
+    if not 1.0 <= rate_hz <= 1e6:
+        raise UsageError(
+            "--views must be off, full, or a number of messages per second from 1 to 1000000, "
+            f"not {text!r}"
+        )
+    return rate_hz

@@ -46,9 +46,9 @@ def sim_command(
     It writes the same kind of log as a live session.
     """
     from ...execution import record_virtual
-    from ...log import parse_viz_rate
     from ...own_code import find_user_laws
     from ...scenario import write_simulated_options
+    from .options import parse_viz_rate
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     if chosen.outside:
@@ -436,8 +436,9 @@ def report_command(
 
     A summary is written beside the page, and with --png also the figures.
     """
-    from ...files import choose_report_folder, make_results_folder, refuse_link
+    from ...files import make_results_folder, refuse_link
     from ...presentation import conclude
+    from ..api import choose_report_folder
 
     log = laws.open(*files)  # so that no folder is created for a log that cannot be read
     if folder is None:

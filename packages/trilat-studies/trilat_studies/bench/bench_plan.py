@@ -36,8 +36,9 @@ from trilat_net.errors import UsageError, suggest_nearest
 from trilat_net.files import write_whole
 from trilat_net.laws import complementary_shares
 from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-from trilat_net.work import Progress, Workers, format_toml_value, ignore_progress
+from trilat_net.work import Progress, Workers, ignore_progress
 
+from ..run_commands import format_toml_value
 from ..tuning.candidate import (
     CandidateClass,
     TuningScenario,

@@ -36,10 +36,9 @@ from trilat_net.analysis import (
     Stability,
     TwinGrowth,
     build_arm_rows,
-    evaluate_ramps,
     judge_virtual_run,
-    list_scripted_ramps,
     list_walls,
+    plan_dominance,
     wall_force,
 )
 from trilat_net.core import Array
@@ -53,12 +52,11 @@ from trilat_net.work import (
     StudyFolder,
     Workers,
     build_resume_hint,
-    describe_program,
     ignore_progress,
     open_worker_pool,
 )
 
-from ..measure_run import RecordBatch, run_whole
+from ..measure_run import RecordBatch, describe_program, run_whole
 from ..tuning.candidate import load_tuning_scenario
 from .bench_plan import (
     SHORTER_REACH,
@@ -724,9 +722,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    period_s = 1.0 / scenario.sites[SLAVE].rate_hz
-    start, ramps = list_scripted_ramps(scenario, SLAVE)
-    alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha  # dominance factors
+    alpha = plan_dominance(scenario, SLAVE, t_s)
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]

@@ -33,7 +33,9 @@ from trilat_net.analysis import (
 )
 from trilat_net.execution import FusedRun, RunTotals, check_fusable
 from trilat_net.results import finite_or_none
-from trilat_net.scenario import Scenario, parse_scenario, refuse_live_only
+from trilat_net.scenario import Scenario, parse_scenario
+
+from ..measure_run import refuse_live_only
 
 if TYPE_CHECKING:
     from trilat_net.execution import RunGroup

@@ -38,8 +38,8 @@ from trilat_net.scenario import (
     is_number,
     read_experiment,
 )
-from trilat_net.work import format_command, format_toml_value, set_options
 
+from ..run_commands import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")

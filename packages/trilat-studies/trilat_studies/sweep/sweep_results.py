@@ -34,15 +34,9 @@ from trilat_net.execution import RunTotals
 from trilat_net.files import write_whole
 from trilat_net.results import Result
 from trilat_net.scenario import read_source
-from trilat_net.work import (
-    MeanInterval,
-    encode_csv,
-    format_command,
-    mean_interval,
-    set_options,
-    wilson_interval,
-)
+from trilat_net.work import MeanInterval, encode_csv, mean_interval, wilson_interval
 
+from ..run_commands import format_command, set_options
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan, plan_from_json
 

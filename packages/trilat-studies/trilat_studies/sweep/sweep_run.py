@@ -43,12 +43,12 @@ from trilat_net.work import (
     WorkerPool,
     Workers,
     build_resume_hint,
-    describe_program,
     ignore_progress,
     open_worker_pool,
 )
 from trilat_net.workers import count_cores
 
+from ..measure_run import describe_program
 from . import sweep_cell
 from .sweep_cell import CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json

@@ -51,11 +51,10 @@ from trilat_net.analysis import (
     Stability,
     build_arm_rows,
     compute_target_motion,
-    evaluate_ramps,
     find_closed_groups,
     find_hanging_sites,
     left_perron_vector,
-    list_scripted_ramps,
+    plan_dominance,
 )
 from trilat_net.core import Array
 from trilat_net.errors import ScenarioError
@@ -70,11 +69,11 @@ from trilat_net.scenario import (
     Wall,
     parse_scenario,
     read_experiment,
-    refuse_live_only,
 )
-from trilat_net.work import format_command, format_toml_value, mean_interval, set_options
+from trilat_net.work import mean_interval
 
-from ..measure_run import RecordBatch, run_whole
+from ..measure_run import RecordBatch, refuse_live_only, run_whole
+from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02
@@ -616,10 +615,8 @@ def _compute_promised_motion(
         return None
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
-        start, ramps = list_scripted_ramps(scenario, name)
-        period_s = 1.0 / scenario.sites[name].rate_hz
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = evaluate_ramps(start, ramps, t_s, period_s).alpha
+        alpha[:, site, peers] = plan_dominance(scenario, name, t_s)
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 
