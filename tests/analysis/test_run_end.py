@@ -14,7 +14,6 @@ from trilat_net.analysis.run_end import (
     RunTrace,
     Stability,
     classify_log_end,
-    classify_run_end,
     reduce_to_buckets,
 )
 from trilat_net.core.step.ticks import BUCKETS_PER_S
@@ -273,7 +272,7 @@ def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
 )
 def test_small_speed_is_rest_only_while_falling(speed, behaviour: EndBehaviour) -> None:
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
-    assert classify_run_end(scenario, trace(speed(T_S))).behaviour is behaviour
+    assert trace(speed(T_S)).classify_end(scenario).behaviour is behaviour
 
 
 @pytest.mark.parametrize(
@@ -288,7 +287,7 @@ def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehavi
     """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
     sinking = trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
-    assert classify_run_end(scenario, sinking).behaviour is behaviour
+    assert sinking.classify_end(scenario).behaviour is behaviour
 
 
 @pytest.mark.parametrize(
@@ -298,6 +297,6 @@ def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehavi
 def test_a_late_change_needs_a_longer_record(at_s: float, stability: Stability) -> None:
     later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
-    run_end = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
+    run_end = trace(np.exp(-0.5 * T_S)).classify_end(scenario)
     assert run_end.stability is stability
     assert ("the loop changes until 39 s" in run_end.text) is (stability is Stability.OPEN)

@@ -22,7 +22,6 @@ __all__ = [
     "Stability",
     "certify_run",
     "classify_log_end",
-    "classify_run_end",
     "find_hanging_sites",
     "judge_virtual_run",
     "reduce_to_buckets",
@@ -51,8 +50,6 @@ __all__ = [
     "TwinGrowth",
     "fit_envelopes",
     "measure_amplitude",
-    "measure_twins",
-    "measure_virtual_twins",
     "twin",
     # Metrics
     "FrequencyResponse",
@@ -191,7 +188,6 @@ if TYPE_CHECKING:
         RunTrace,
         Stability,
         classify_log_end,
-        classify_run_end,
         find_hanging_sites,
         reduce_to_buckets,
     )
@@ -251,8 +247,6 @@ if TYPE_CHECKING:
         PushGrowth,
         TwinGrowth,
         measure_amplitude,
-        measure_twins,
-        measure_virtual_twins,
         twin,
     )
 else:
@@ -287,7 +281,7 @@ else:
             "metrics.motion_metrics": "measure_undelayed_error",
             "run_end": (
                 "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
-                "classify_log_end classify_run_end find_hanging_sites reduce_to_buckets"
+                "classify_log_end find_hanging_sites reduce_to_buckets"
             ),
             "run_view": "RunView",
             "site_signals": (
@@ -322,8 +316,7 @@ else:
             ),
             "twins.envelope_trend": "EnvelopeTrend fit_envelopes",
             "twins.twin_growth": (
-                "MOST_LOG PushGrowth PushedTwins TwinGrowth measure_amplitude measure_twins "
-                "measure_virtual_twins twin"
+                "MOST_LOG PushGrowth PushedTwins TwinGrowth measure_amplitude twin"
             ),
         },
     )

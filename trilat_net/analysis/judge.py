@@ -22,7 +22,7 @@ from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import explain_no_functional
 from .certificate.stability_certificate import Certificate, certify
 from .delay_period import find_final_link
-from .run_end import RunEnd, RunTrace, Stability, classify_run_end
+from .run_end import RunEnd, RunTrace, Stability
 from .run_remarks import list_remarks
 from .stability_decision import (
     LoopRoots,
@@ -33,7 +33,7 @@ from .stability_decision import (
 )
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from .theory.operating_point import has_lasting_delays
-from .twins.twin_growth import TwinGrowth, measure_twins, measure_virtual_twins
+from .twins.twin_growth import TwinGrowth
 
 
 def list_law_proofs(scenario: Scenario) -> list[str]:
@@ -87,7 +87,7 @@ def certify_run(
     certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
     growth = None
     if twins != 0:
-        growth = measure_twins(log, certificate.end, twins, own_laws=own_laws)
+        growth = TwinGrowth.of_log(log, certificate.end, twins, own_laws=own_laws)
     final_scenario = resolve_final_scenario(log)
     return replace(
         certificate,
@@ -143,7 +143,7 @@ def judge_virtual_run(
         ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     if end is None:
         trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-        end = classify_run_end(ended, trace)
+        end = trace.classify_end(ended)
     findings = RunFindings(
         end=end,
         roots=find_run_roots(ended, run),
@@ -151,7 +151,7 @@ def judge_virtual_run(
     )
     twins = None
     if not is_decided_by_roots(findings):
-        twins = measure_virtual_twins(ended, end, run.ran_s)
+        twins = TwinGrowth.of_scenario(ended, end, run.ran_s)
         findings = findings._replace(twins=twins)
     decision = decide_stability(findings)
     is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)

@@ -288,6 +288,67 @@ class RunTrace(NamedTuple):
     pushed_until_s: float = 0.0
     changed_until_s: float = 0.0
 
+    def classify_end(self, scenario: Scenario) -> RunEnd:
+        """Judges from reduced data whether the motion died away at the end of a run.
+
+        The worst joint of all sites decides. A run that is stable by the trends of its joints
+        is left open if its sites do not agree, if arms fell, or if the control loop changed
+        until shortly before the end.
+
+        Args:
+            scenario: The description of the experiment.
+        """
+        sites = _split_buckets(scenario, self)
+        # the last interval may be incomplete
+        count = max(min(map(len, sites)) - 1, 0)
+        recorded_by_site = [site[:count, 0, 0] >= 0.0 for site in sites]
+        recorded = np.all(recorded_by_site, axis=0)
+        rows = np.flatnonzero(recorded)
+        span_s = count / BUCKETS_PER_S
+        all_t_s = rows / BUCKETS_PER_S
+
+        acted_s = max(self.pushed_until_s, _find_last_operator_action(scenario, span_s))
+        changed_s = max(self.changed_until_s, _find_last_change(scenario, span_s))
+        quiet_from_s = max(acted_s, changed_s)
+        first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
+        _, operator_disturbs = _choose_judged_part(all_t_s, acted_s)
+        operator_acts = is_disturbed and operator_disturbs
+        t_s = all_t_s[first:]
+        judged_rows = rows[first:]
+        columns = [site[judged_rows] for site in sites]
+
+        worst = _find_worst_joint(scenario, t_s, columns, sites)
+        missing = []
+        for name, data in zip(scenario.names, sites, strict=True):
+            if not len(data):
+                missing.append(name)
+        end = worst._replace(
+            missing_sites=tuple(missing),
+            counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
+            quiet_from_s=quiet_from_s,
+            lasts_s=span_s,
+        )
+        first_site = scenario.sites[scenario.names[0]]
+        if first_site.task.space == "position":
+            end = end._replace(error_unit="m")
+
+        if self.diverged_at_s is not None:
+            return end._replace(
+                behaviour=EndBehaviour.DIVERGED, diverged_at_s=self.diverged_at_s
+            )
+        if end.behaviour.stability is Stability.SETTLED:
+            reasons = list(_find_disagreement(scenario, self, t_s, columns))
+            reasons += _find_odd_pose(scenario, sites)
+            if is_disturbed and not operator_acts:
+                reasons.append(
+                    f"the loop changes until {changed_s:.4g} s, within the judged part"
+                )
+            return end._replace(reasons=tuple(reasons))
+        if operator_acts:
+            reason = f"an operator acts until {acted_s:.4g} s, within the judged part"
+            return end._replace(operator_acts=True, reasons=(reason,))
+        return end
+
 
 NO_BUCKETS = np.zeros((0, 3))
 """The buckets of a site without records."""
@@ -410,7 +471,7 @@ def classify_log_end(log: Log) -> RunEnd:
     Args:
         log: The log of the run.
     """
-    end = classify_run_end(log.scenario, trace_log(log))
+    end = trace_log(log).classify_end(log.scenario)
     error = find_last_error(log)
     if error is not None:
         end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
@@ -420,65 +481,6 @@ def classify_log_end(log: Log) -> RunEnd:
         return end
     parts = [log[site] for site in log.sites]
     return end._replace(frequency_hz=_find_frequency_hz(parts))
-
-
-def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
-    """Judges from reduced data whether the motion died away at the end of a run.
-
-    The worst joint of all sites decides. A run that is stable by the trends of its joints is
-    left open if its sites do not agree, if arms fell, or if the control loop changed until
-    shortly before the end.
-
-    Args:
-        scenario: The description of the experiment.
-        trace: The reduced data of the run.
-    """
-    sites = _split_buckets(scenario, trace)
-    # the last interval may be incomplete
-    count = max(min(map(len, sites)) - 1, 0)
-    recorded_by_site = [site[:count, 0, 0] >= 0.0 for site in sites]
-    recorded = np.all(recorded_by_site, axis=0)
-    rows = np.flatnonzero(recorded)
-    span_s = count / BUCKETS_PER_S
-    all_t_s = rows / BUCKETS_PER_S
-
-    acted_s = max(trace.pushed_until_s, _find_last_operator_action(scenario, span_s))
-    changed_s = max(trace.changed_until_s, _find_last_change(scenario, span_s))
-    quiet_from_s = max(acted_s, changed_s)
-    first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
-    _, operator_disturbs = _choose_judged_part(all_t_s, acted_s)
-    operator_acts = is_disturbed and operator_disturbs
-    t_s = all_t_s[first:]
-    judged_rows = rows[first:]
-    columns = [site[judged_rows] for site in sites]
-
-    worst = _find_worst_joint(scenario, t_s, columns, sites)
-    missing = []
-    for name, data in zip(scenario.names, sites, strict=True):
-        if not len(data):
-            missing.append(name)
-    end = worst._replace(
-        missing_sites=tuple(missing),
-        counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
-        quiet_from_s=quiet_from_s,
-        lasts_s=span_s,
-    )
-    first_site = scenario.sites[scenario.names[0]]
-    if first_site.task.space == "position":
-        end = end._replace(error_unit="m")
-
-    if trace.diverged_at_s is not None:
-        return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
-    if end.behaviour.stability is Stability.SETTLED:
-        reasons = list(_find_disagreement(scenario, trace, t_s, columns))
-        reasons += _find_odd_pose(scenario, sites)
-        if is_disturbed and not operator_acts:
-            reasons.append(f"the loop changes until {changed_s:.4g} s, within the judged part")
-        return end._replace(reasons=tuple(reasons))
-    if operator_acts:
-        reason = f"an operator acts until {acted_s:.4g} s, within the judged part"
-        return end._replace(operator_acts=True, reasons=(reason,))
-    return end
 
 
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:

@@ -32,7 +32,6 @@ from trilat_net.analysis import (
     RunTrace,
     Stability,
     build_arm_rows,
-    classify_run_end,
     find_quantity,
     list_walls,
     measure_run,
@@ -333,7 +332,7 @@ def run_whole(scenario: Scenario) -> _WholeRun:
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
     trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return _WholeRun(records, classify_run_end(scenario, trace), run)
+    return _WholeRun(records, trace.classify_end(scenario), run)
 
 
 class Range(NamedTuple):
@@ -792,7 +791,7 @@ def _compute_run_metrics(
 
     return RunMetrics(
         simulated_s=max(durations_s, default=0.0),
-        end=classify_run_end(scenario, trace),
+        end=trace.classify_end(scenario),
         synchronised_at_s=synchronised_at_s,
         peak_error_rad=find_largest("peak_error_rad"),
         rms_error_rad=find_largest("rms_error_rad"),

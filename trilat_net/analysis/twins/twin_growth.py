@@ -365,60 +365,62 @@ class TwinGrowth(NamedTuple):
             text += f"; a run of {self.needs_s:.3g} s would tell"
         return text
 
+    @classmethod
+    def of_log(
+        cls,
+        log: Log,
+        end: RunEnd,
+        count: int | None = None,
+        *,
+        own_laws: bool = False,
+    ) -> "TwinGrowth":
+        """Repeats a recorded run with small pushes, and judges whether the pushes grow.
 
-def measure_twins(
-    log: Log,
-    end: RunEnd,
-    count: int | None = None,
-    *,
-    own_laws: bool = False,
-) -> TwinGrowth:
-    """Repeats a recorded run with small pushes, and judges whether the pushes grow.
+        Each repetition with a push is called a twin.
 
-    Each repetition with a push is called a twin.
+        Args:
+            log: The log of the run.
+            end: The end of the run, which states from when on the run is judged.
+            count: Number of twins. None for one push of every joint.
+            own_laws: True to run the code of control laws that are not part of this program.
 
-    Args:
-        log: The log of the run.
-        end: The end of the run, which states from when on the run is judged.
-        count: Number of twins. None for one push of every joint.
-        own_laws: True to run the code of control laws that are not part of this program.
+        Returns:
+            The growth of the pushes. If the run cannot be repeated, the result contains no
+            pushes, and the reason.
 
-    Returns:
-        The growth of the pushes. If the run cannot be repeated, the result contains no pushes,
-        and the reason.
+        Raises:
+            LogError: A record cannot be read.
+        """
+        try:
+            twins = Twins.of_log(log, Push.choose(log.scenario, count), own_laws=own_laws)
+        except NotRepeatable as error:
+            return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
+        return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
-    Raises:
-        LogError: A record cannot be read.
-    """
-    try:
-        twins = Twins.of_log(log, Push.choose(log.scenario, count), own_laws=own_laws)
-    except NotRepeatable as error:
-        return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
-    return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
+    @classmethod
+    def of_scenario(
+        cls,
+        scenario: Scenario,
+        end: RunEnd,
+        duration_s: float,
+        count: int | None = None,
+    ) -> "TwinGrowth":
+        """Simulates a scenario with small pushes, and judges whether the pushes grow.
 
+        This needs no log: the run and its repetitions with a push, the twins, are executed in
+        virtual time.
 
-def measure_virtual_twins(
-    scenario: Scenario,
-    end: RunEnd,
-    duration_s: float,
-    count: int | None = None,
-) -> TwinGrowth:
-    """Simulates a scenario with small pushes, and judges whether the pushes grow.
+        Args:
+            scenario: The description of the experiment.
+            end: The end of the run, which states from when on the run is judged.
+            duration_s: Length of the run, in s.
+            count: Number of twins. None for one push of every joint.
 
-    This needs no log: the run and its repetitions with a push, the twins, are executed in
-    virtual time.
-
-    Args:
-        scenario: The description of the experiment.
-        end: The end of the run, which states from when on the run is judged.
-        duration_s: Length of the run, in s.
-        count: Number of twins. None for one push of every joint.
-
-    Raises:
-        ScenarioError: The scenario cannot run in virtual time.
-    """
-    twins = Twins.of_scenario(scenario, Push.choose(scenario, count), duration_s)
-    return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
+        Raises:
+            ScenarioError: The scenario cannot run in virtual time.
+        """
+        twins = Twins.of_scenario(scenario, Push.choose(scenario, count), duration_s)
+        return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
 def judge_twins(

@@ -29,9 +29,9 @@ from ...analysis import (
     EnvelopeTrend,
     PushedTwins,
     PushGrowth,
+    TwinGrowth,
     classify_log_end,
     measure_amplitude,
-    measure_twins,
 )
 from ...core import BUCKETS_PER_S, Array
 from ...execution import SMALLEST, TwinPath, Twins, explain_not_repeatable
@@ -135,7 +135,7 @@ def _explain_absent_twins(log: Log) -> str:
 def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
     """Draws the differences of twins that are pushed at the start of a log's run."""
     own_laws = may_run_user_laws(log.scenario)
-    growth = measure_twins(log, classify_log_end(log), own_laws=own_laws)
+    growth = TwinGrowth.of_log(log, classify_log_end(log), own_laws=own_laws)
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 
 

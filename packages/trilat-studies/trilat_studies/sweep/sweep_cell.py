@@ -26,10 +26,9 @@ from trilat_net.analysis import (
     EndBehaviour,
     RunTrace,
     Stability,
-    classify_run_end,
+    TwinGrowth,
     find_run_roots,
     judge_virtual_run,
-    measure_virtual_twins,
 )
 from trilat_net.execution import FusedRun, RunTotals, check_fusable
 from trilat_net.results import finite_or_none
@@ -345,8 +344,8 @@ def measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
-    twins = measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
 
@@ -436,7 +435,7 @@ def _build_result(
         totals: Totals over the scenario's duration, without extensions.
         extended: Number of times that the duration was doubled.
     """
-    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
     return CellResult(
         verdict=classify_decision(end.stability, end.behaviour),
         motion=end.behaviour,
