@@ -35,9 +35,8 @@ from trilat_net.net import (
     HandMessage,
     HandViewMessage,
     SiteClient,
+    SiteSender,
     SystemClock,
-    make_hand_sender,
-    open_bus,
     read_messages,
     topics,
 )
@@ -85,7 +84,7 @@ class HandProcess(SiteClient):
         site_rate_hz = hand_site.scenario.sites[hand_site.name].rate_hz
         self._ticks_per_view = site_rate_hz // hand_site.rate_hz
 
-        self._sender = make_hand_sender(bus, clock, session, hand_site.name)
+        self._sender = SiteSender.for_hand(bus, clock, session, hand_site.name)
         self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), _VIEWS_KEPT)
         self._announced_ns = 0
         self._waiting_views = deque[HandViewMessage]()
@@ -223,9 +222,7 @@ def run_hand(
     clock = SystemClock()
     stopped = interrupt.is_requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-    bus = open_bus(
-        connection=connection, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
-    )
+    bus = connection.open_bus(clock=clock, stopped=stopped, timeout_s=timeout_s, say=say)
     if bus is None:
         return
 

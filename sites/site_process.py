@@ -25,7 +25,6 @@ from trilat_net.net import (
     SessionJoin,
     describe_member,
     make_system_clock,
-    open_bus,
     share_threads,
     topics,
 )
@@ -77,8 +76,7 @@ def run_site(
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
 
-        bus = open_bus(
-            connection=options.connection,
+        bus = options.connection.open_bus(
             clock=clock,
             stopped=interrupt.is_requested,
             timeout_s=options.join_timeout_s,

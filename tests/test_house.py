@@ -50,10 +50,10 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 319,
-    "session": 286,
-    "analysis": 119,
-    "app": 62,
+    "kernel": 318,
+    "session": 280,
+    "analysis": 111,
+    "app": 60,
     "studies": 9,
     "people": 9,
     "ros2": 28,

@@ -9,7 +9,7 @@ from tests.core.sites import setup
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import MAX_DELAY_US, max_delay_us
 from trilat_net.core.links.link import calendar_pages
-from trilat_net.core.step.site_arrays import build_site_arrays, stack_site_arrays
+from trilat_net.core.step.site_arrays import SiteArrays, stack_site_arrays
 from trilat_net.scenario import load_scenario
 
 
@@ -43,7 +43,7 @@ def test_stacked_tables_hold_each_sites_own() -> None:
     setups = [scenario.setup(name) for name in scenario.names]
     whole = stack_site_arrays(setups)
     for n, setup_of_lane in enumerate(setups):
-        site_arrays = build_site_arrays(setup_of_lane)
+        site_arrays = SiteArrays.build(setup_of_lane)
         assert whole.site[n].tobytes() == site_arrays.site.tobytes()
         assert whole.links[n].tobytes() == site_arrays.links.tobytes()
         assert whole.ramps[n].tobytes() == site_arrays.ramps.tobytes()

@@ -79,8 +79,6 @@ __all__ = [
     "Transparency",
     "TwoPort",
     "analyse_linear_loop",
-    "compute_growth_column",
-    "derive_operating_conditions",
     "find_rightmost_root",
     "find_root_crossings",
     "find_run_roots",
@@ -100,14 +98,11 @@ __all__ = [
     "build_arm_rows",
     "compute_operator_script",
     "compute_target_motion",
-    "find_error_of_last_second",
-    "find_largest_error",
     "joint_positions_m",
     "largest_magnitude",
     "list_walls",
     "settling_time_of_all_s",
     "site_signals",
-    "split_torque",
     "upright_axes",
     "wall_depth",
     "wall_force",
@@ -195,8 +190,6 @@ if TYPE_CHECKING:
     from .site_signals import (
         SETTLED_ERROR_RAD,
         JointError,
-        find_error_of_last_second,
-        find_largest_error,
         largest_magnitude,
         settling_time_of_all_s,
     )
@@ -210,16 +203,11 @@ if TYPE_CHECKING:
     from .theory.linear_edge import (
         EdgeScan,
         GrowthColumn,
-        compute_growth_column,
         find_rightmost_root,
         find_root_crossings,
     )
     from .theory.loop_roots import find_run_roots
-    from .theory.operating_point import (
-        Equilibrium,
-        OperatingConditions,
-        derive_operating_conditions,
-    )
+    from .theory.operating_point import Equilibrium, OperatingConditions
     from .theory.port_analysis import PortAnalysis, TwoPort
     from .theory.port_passivity import Passivity
     from .theory.port_response import QUOTED_AT_HZ, Transparency
@@ -236,7 +224,6 @@ if TYPE_CHECKING:
         compute_operator_script,
         compute_target_motion,
         list_walls,
-        split_torque,
         wall_depth,
         wall_force,
     )
@@ -285,8 +272,8 @@ else:
             ),
             "run_view": "RunView",
             "site_signals": (
-                "JointError SETTLED_ERROR_RAD find_error_of_last_second find_largest_error "
-                "largest_magnitude settling_time_of_all_s site_signals"
+                "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "
+                "site_signals"
             ),
             "stability_decision": "LoopRoots",
             "theory.characteristic_roots": "CharacteristicRoot Complex Spectrum",
@@ -296,13 +283,10 @@ else:
             "theory.hand_files": "read_hands",
             "theory.linear_analysis": "LinearAnalysis analyse_linear_loop",
             "theory.linear_edge": (
-                "EdgeScan GrowthColumn compute_growth_column find_rightmost_root "
-                "find_root_crossings"
+                "EdgeScan GrowthColumn find_rightmost_root find_root_crossings"
             ),
             "theory.loop_roots": "find_run_roots",
-            "theory.operating_point": (
-                "Equilibrium OperatingConditions derive_operating_conditions"
-            ),
+            "theory.operating_point": "Equilibrium OperatingConditions",
             "theory.port_analysis": "PortAnalysis TwoPort",
             "theory.port_passivity": "Passivity",
             "theory.port_response": "QUOTED_AT_HZ Transparency",
@@ -312,7 +296,7 @@ else:
             ),
             "torque_sources": (
                 "TorqueSplit compute_operator_script compute_target_motion list_walls "
-                "split_torque wall_depth wall_force"
+                "wall_depth wall_force"
             ),
             "twins.envelope_trend": "EnvelopeTrend fit_envelopes",
             "twins.twin_growth": (

@@ -49,8 +49,6 @@ from ..net import (
     find_endpoint_addresses,
     is_loopback,
     read_member_keys,
-    resolve_member_connection,
-    secure_connection,
 )
 from .session_ping import ping_session
 
@@ -121,7 +119,7 @@ def examine_machine(
     yield from examine_links(connection, keys, member_keys, insecure=insecure)
     yield from examine_clock(clock)
     if session is not None:
-        safe = secure_connection(connection, member_keys, insecure=insecure)
+        safe = connection.secure(member_keys, insecure=insecure)
         yield from _examine_offsets(safe, clock, session)
     yield examine_system()
     yield from examine_rights()
@@ -192,7 +190,7 @@ def examine_links(
         all.
     """
     try:
-        safe = secure_connection(connection, member_keys, insecure=insecure)
+        safe = connection.secure(member_keys, insecure=insecure)
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
@@ -682,7 +680,7 @@ def doctor(
         UsageError: An endpoint or the keys cannot be used.
     """
     findings = examine_machine(
-        connection=resolve_member_connection(listen, connect, router),
+        connection=Connection.of_member(listen, connect, router),
         keys=None if keys is None else Path(keys),
         folder=Path(folder),
         session=session,

@@ -51,7 +51,6 @@ from ..net import (
     create_keys,
     find_free_endpoints,
     read_member_keys,
-    secure_connection,
 )
 from ..scenario import ConstantDelay
 
@@ -255,7 +254,7 @@ def _open(
         connection = Connection(connect=[endpoint])
         name = NEAR
 
-    bus = secure_connection(connection, used_keys, insecure=insecure).open()
+    bus = connection.secure(used_keys, insecure=insecure).open()
     return bus, used_keys.member if used_keys else name
 
 

@@ -47,8 +47,6 @@ from ..net import (
     list_past_events,
     read_messages,
     read_records,
-    resolve_member_connection,
-    secure_connection,
     send_change,
 )
 from ..scenario import PictureDelay, parse_core_change
@@ -791,8 +789,8 @@ def session(
     Raises:
         UsageError: An endpoint or the keys cannot be used.
     """
-    connection = resolve_member_connection(None, connect, router)
-    return RunningSession(name, secure_connection(connection, keys, insecure=False))
+    connection = Connection.of_member(None, connect, router)
+    return RunningSession(name, connection.secure(keys, insecure=False))
 
 
 def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
@@ -851,9 +849,7 @@ def hand(
         UsageError: The scenario permits no live operator at that arm, or an endpoint cannot be
             used.
     """
-    connection = secure_connection(
-        resolve_member_connection(None, connect, router), keys, insecure=False
-    )
+    connection = Connection.of_member(None, connect, router).secure(keys, insecure=False)
     with (
         RunningSession(session, connection).reach_site(site, timeout_s) as (bus, scenario),
         open_hand(

@@ -56,7 +56,6 @@ __all__ = [
     "TaskSetup",
     "TickRepeater",
     "apply_change",
-    "build_site_arrays",
     "links_bytes",
     "make_layout",
     "needed_pages",
@@ -418,7 +417,6 @@ if TYPE_CHECKING:
         MAX_RAMPS,
         SiteArrays,
         apply_change,
-        build_site_arrays,
         links_bytes,
         needed_pages,
         select_site,
@@ -548,8 +546,8 @@ else:
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.row_fields": "LinkRow",
             "step.site_arrays": (
-                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays apply_change "
-                "build_site_arrays links_bytes needed_pages select_site stack_site_arrays"
+                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays apply_change links_bytes "
+                "needed_pages select_site stack_site_arrays"
             ),
             "step.site_setup": (
                 "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "

@@ -54,7 +54,6 @@ __all__ = [
     "ChannelFilter",
     "active_path",
     "find_parts",
-    "parse_channel_filter",
     # Checking, signing and recovering
     "LAST",
     "MIN_COVERAGE",
@@ -112,7 +111,6 @@ __all__ = [
     "pack_event",
     "pack_session_diagnostics",
     "read_ros2_channels",
-    "read_topic_table",
     "ros2_messages",
 ]
 
@@ -142,7 +140,6 @@ if TYPE_CHECKING:
         ChannelFilter,
         active_path,
         find_parts,
-        parse_channel_filter,
     )
     from .log_reader import Log, open_log, open_logs, read_link_delays
     from .log_signature import check_signatures, create_signing_keys, sign_log
@@ -201,7 +198,6 @@ if TYPE_CHECKING:
         RobotTable,
         TopicTable,
         make_session_name,
-        read_topic_table,
     )
     from .running_digest import Integrity
     from .session_check import LogCheckResult, check_file, judge_integrity
@@ -219,7 +215,7 @@ else:
             "log_layout": (
                 "ACTIVE_SUFFIX ALL_CHANNELS CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
                 "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT "
-                "active_path find_parts parse_channel_filter"
+                "active_path find_parts"
             ),
             "log_reader": "Log open_log open_logs read_link_delays",
             "log_signature": "check_signatures create_signing_keys sign_log",
@@ -251,8 +247,7 @@ else:
             ),
             "ros2.rviz_config": "build_rviz_config",
             "ros2.topic_names": (
-                "DIAGNOSTICS FRAMES_TOPIC NAMINGS RobotTable TopicTable make_session_name "
-                "read_topic_table"
+                "DIAGNOSTICS FRAMES_TOPIC NAMINGS RobotTable TopicTable make_session_name"
             ),
             "running_digest": "Integrity",
             "session_check": "LogCheckResult check_file judge_integrity",

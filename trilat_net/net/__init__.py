@@ -40,12 +40,9 @@ __all__ = [
     "is_loopback",
     "make_site_known",
     "matches_key",
-    "open_bus",
     "read_zenoh_file",
     "reserve_session_endpoints",
-    "resolve_member_connection",
     "run_router",
-    "secure_connection",
     "share_threads",
     "stop_at_once",
     # Keys of members
@@ -150,7 +147,6 @@ __all__ = [
     "SiteClient",
     "SiteSender",
     "SwitchClient",
-    "make_hand_sender",
     # ROS 2
     "DISTROS",
     "ROUTER_ADVICE",
@@ -164,14 +160,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from . import messages, topics
-    from .arm_client import (
-        ArmClient,
-        Hand,
-        SiteClient,
-        SiteSender,
-        SwitchClient,
-        make_hand_sender,
-    )
+    from .arm_client import ArmClient, Hand, SiteClient, SiteSender, SwitchClient
     from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
     from .clock import Clock, SystemClock, make_system_clock
     from .connection import (
@@ -183,11 +172,8 @@ if TYPE_CHECKING:
         find_endpoint_addresses,
         find_free_endpoints,
         is_loopback,
-        open_bus,
         reserve_session_endpoints,
-        resolve_member_connection,
         run_router,
-        secure_connection,
     )
     from .discovery import (
         REPLY_TIMEOUT_S,
@@ -304,14 +290,13 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "arm_client": "ArmClient Hand SiteClient SiteSender SwitchClient make_hand_sender",
+            "arm_client": "ArmClient Hand SiteClient SiteSender SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
             "clock": "Clock SystemClock make_system_clock",
             "connection": (
                 "Connection ENCRYPTED ENDS_SOON default_endpoint default_endpoints "
-                "find_endpoint_addresses find_free_endpoints is_loopback open_bus "
-                "reserve_session_endpoints resolve_member_connection run_router "
-                "secure_connection"
+                "find_endpoint_addresses find_free_endpoints is_loopback "
+                "reserve_session_endpoints run_router"
             ),
             "discovery": (
                 "REPLY_TIMEOUT_S connect_to_session find_members list_past_events "

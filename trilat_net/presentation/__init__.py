@@ -40,7 +40,6 @@ __all__ = [
     "FigureSize",
     "figure",
     "is_position",
-    "make_print_size",
     "style",
     "write_figure",
     "write_figures",
@@ -59,7 +58,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from . import style, terminal_output
-    from .appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, make_print_size
+    from .appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize
     from .certificate_text import describe_judgement
     from .citation import compose_citation
     from .conclusion import Conclusion, conclude, conclude_files
@@ -82,7 +81,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "appearance": "COLUMN_IN FigureSize REPORT_SIZE SITE_COLOURS make_print_size",
+            "appearance": "COLUMN_IN FigureSize REPORT_SIZE SITE_COLOURS",
             "certificate_text": "describe_judgement",
             "citation": "compose_citation",
             "conclusion": "Conclusion conclude conclude_files",

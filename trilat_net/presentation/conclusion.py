@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..analysis import certify_run, find_error_of_last_second
+from ..analysis import JointError, certify_run
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
 from ..execution import check_log_files, simulate_without_operators
 from ..log import MIN_COVERAGE, CheckReport, Finding, Log, Progress, SiteLog
@@ -260,7 +260,7 @@ def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
         ticks = max(log.last_ticks[site], records.last_tick) + 1
         missing = ticks - len(records) - log.absent_ticks(site)
         times = _list_timing_cells(records) if is_timed else []
-        error = find_error_of_last_second(records)
+        error = JointError.find_in_last_second(records)
         cells = ["", ""]
         if error is not None:
             cells = [f"{error.value:.3g}", error.joint.removeprefix(f"{site} ")]

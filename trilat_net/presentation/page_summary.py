@@ -26,8 +26,6 @@ from ..analysis import (
     JointError,
     RunView,
     Stability,
-    find_error_of_last_second,
-    find_largest_error,
     list_alarms,
     measure_undelayed_error,
 )
@@ -241,7 +239,7 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
     Returns:
         The first record with this error. None if no record has a finite error.
     """
-    peaks = [find_largest_error(log[site]) for site in sites or log.sites]
+    peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
     known = [peak for peak in peaks if peak is not None]
     return max(known, key=lambda peak: peak.value, default=None)
 
@@ -277,7 +275,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     unit = shared_unit(log)
     detail = f"largest, of {peak.joint}, at {peak.t_s:.2f} s"
 
-    last_errors = [find_error_of_last_second(log[site]) for site in sites]
+    last_errors = [JointError.find_in_last_second(log[site]) for site in sites]
     known = [error for error in last_errors if error is not None]
     last = max(known, key=lambda error: error.value, default=None)
     if last is not None:

@@ -18,12 +18,12 @@ from ..log import (
     NAMINGS,
     VIZ_ROOT,
     Ros2Channel,
+    TopicTable,
     build_rviz_config,
     list_full_topics,
     make_session_name,
     open_log,
     read_ros2_channels,
-    read_topic_table,
 )
 from .foxglove_layout import build_foxglove_layout
 from .rerun_viewer import build_plot_layout
@@ -110,5 +110,5 @@ def _list_session_topics(log: Path) -> dict[str, Ros2Channel]:
     """
     opened = open_log(log)
     session = make_session_name(opened.session["session"])
-    table = read_topic_table(NAMINGS[0])
+    table = TopicTable.read(NAMINGS[0])
     return list_full_topics(opened.scenario, session, table)

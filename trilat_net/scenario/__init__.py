@@ -32,7 +32,6 @@ __all__ = [
     "new_plant",
     "parse_embedded",
     "parse_scenario",
-    "read_experiment",
     "read_source",
     "read_template",
     "refuse_external_arms",
@@ -180,7 +179,6 @@ if TYPE_CHECKING:
         load_scenario,
         parse_embedded,
         parse_scenario,
-        read_experiment,
         read_source,
         read_template,
         reseed_scenario,
@@ -225,8 +223,7 @@ else:
             "sample_uses": "LinkSchedule PictureDelay draw_used_samples first_ticks",
             "scenario_reader": (
                 "ExperimentText embedded_names_reader find_site list_shipped load_scenario "
-                "parse_embedded parse_scenario read_experiment read_source read_template "
-                "reseed_scenario"
+                "parse_embedded parse_scenario read_source read_template reseed_scenario"
             ),
             "scenario_types": "Change Limits Scenario SiteSpec scheduled_links",
             "simulated_arm": "SimulatedArm",

@@ -21,7 +21,6 @@ __all__ = [
     "encode_csv",
     # Intervals of confidence
     "MeanInterval",
-    "mean_interval",
     "wilson_interval",
 ]
 
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
         ignore_progress,
         open_worker_pool,
     )
-    from .intervals import MeanInterval, mean_interval, wilson_interval
+    from .intervals import MeanInterval, wilson_interval
     from .study_folder import RunJournal, StudyFolder, build_resume_hint, encode_csv
 else:
     __getattr__ = import_on_use(
@@ -46,7 +45,7 @@ else:
                 "MAX_LOSSES Progress WorkerPool Workers check_workers count_workers "
                 "ignore_progress open_worker_pool"
             ),
-            "intervals": "MeanInterval mean_interval wilson_interval",
+            "intervals": "MeanInterval wilson_interval",
             "study_folder": "RunJournal StudyFolder build_resume_hint encode_csv",
         },
     )

@@ -43,9 +43,9 @@ from scipy.special import stdtrit
 from trilat_net.analysis import (
     AlignedRecords,
     Complex,
+    TorqueSplit,
     align_records,
     compute_operator_script,
-    split_torque,
 )
 from trilat_net.core import SCRIPTED_KINDS, Array
 from trilat_net.errors import UsageError, count_nouns
@@ -379,7 +379,7 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
     Returns:
         The force in N and the position in m, shape (K, n) each for K records.
     """
-    split = split_torque(records, scenario)
+    split = TorqueSplit.of_records(records, scenario)
     end_effector = split.end_effector
     scripted_torque = np.zeros_like(records.q)
     for hand in scenario.sites[records.site].hands:

@@ -48,7 +48,7 @@ def ros2_command(
         rviz: Write a configuration of RViz that shows the arms of the session.
     """
     from trilat_net.app import RunningSession
-    from trilat_net.log import read_topic_table
+    from trilat_net.log import TopicTable
     from trilat_net.net import BRIDGE, DISTROS, Refusals, Ros2Graph, check_hosts, check_ros_name
 
     from .ros2_bridge import serve_ros2
@@ -56,7 +56,7 @@ def ros2_command(
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro must be one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
-    table = read_topic_table(names)
+    table = TopicTable.read(names)
     # Checked now, because the bridge would wait for a router at a wrong address forever.
     check_hosts(ros or ())
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))

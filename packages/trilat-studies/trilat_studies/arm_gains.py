@@ -45,7 +45,6 @@ from trilat_net.analysis import (
     EnvelopeTrend,
     Equilibrium,
     OperatingConditions,
-    derive_operating_conditions,
     find_rightmost_root,
     find_samples_in_use,
     fit_envelopes,
@@ -439,7 +438,7 @@ class _GainSearch:
         # Damping ratio at the edge, where the damping is the same and K larger by the margin.
         self._damping = damping / math.sqrt(margin)
 
-        self.conditions = derive_operating_conditions(scenario)
+        self.conditions = OperatingConditions.derive(scenario)
         self.constant_conditions = self.conditions
         self.rate_hz = self.conditions.sites[0].rate_hz
         if self.conditions.varying:

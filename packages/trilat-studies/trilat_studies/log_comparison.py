@@ -25,7 +25,7 @@ from trilat_net.presentation import (
 )
 from trilat_net.results import Result
 from trilat_net.scenario import ScenarioDifference, compare_scenarios, reseed_scenario
-from trilat_net.work import MeanInterval, mean_interval
+from trilat_net.work import MeanInterval
 
 from .tuning.candidate import check_final_posture
 
@@ -405,7 +405,7 @@ def _average_repeats(
         return []
     if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
         return []
-    return [mean_interval(row.values) for row in metrics.rows]
+    return [MeanInterval.of_values(row.values) for row in metrics.rows]
 
 
 def _tabulate_quantities(

@@ -76,14 +76,14 @@ def _draw_map(
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler that computes the map instead.
     """
-    from trilat_net.presentation import COLUMN_IN, make_print_size
+    from trilat_net.presentation import COLUMN_IN, FigureSize
 
     from .sweep.fixed_gains import FAIR_COMPARISON
     from .sweep.map_page import write_map
     from .sweep.stability_map import build_stability_map
     from .sweep.sweep_plan import build_sweep_command
 
-    size = make_print_size(COLUMN_IN if width is None else width)
+    size = FigureSize.for_print(COLUMN_IN if width is None else width)
     width_option = [] if width is None else ["--width", f"{width:g}"]
     command = build_sweep_command(results.plan, "--map", *width_option)
     terminal.print_text("map: the lines of theory ...")

@@ -52,15 +52,8 @@ from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import Block, MarkedText, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import Scenario, load_scenario, read_experiment, reseed_scenario
-from trilat_net.work import (
-    MAX_LOSSES,
-    MeanInterval,
-    WorkerPool,
-    Workers,
-    mean_interval,
-    open_worker_pool,
-)
+from trilat_net.scenario import ExperimentText, Scenario, load_scenario, reseed_scenario
+from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
 
 from .measure_run import (
     ExpectationResult,
@@ -218,7 +211,7 @@ def trials(
             expectations.
     """
     scenario = load_scenario(source, set)
-    label = read_experiment(source).label
+    label = ExperimentText.read(source).label
     _check_expectations_reachable(scenario, label)
     if not live:
         check_virtual(scenario)
@@ -412,7 +405,7 @@ class TrialReport(Result):
                     worst=worst,
                     held=sum(outcome.held for outcome in outcomes),
                     runs=len(outcomes),
-                    mean=mean_interval([outcome.value for outcome in outcomes]),
+                    mean=MeanInterval.of_values([outcome.value for outcome in outcomes]),
                 )
                 rows.append(row)
 

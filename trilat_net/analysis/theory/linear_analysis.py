@@ -47,7 +47,7 @@ from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
 from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
 from .numeric_law import NumericLaw
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .port_passivity import HandMatrices
 
@@ -299,7 +299,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
         scenario: The scenario of the run.
         log: The log of the run. None to simulate the run.
     """
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     try:
         if log is not None:
             scenario = resolve_final_scenario(log)
@@ -359,7 +359,7 @@ def analyse_linear_loop(
         log = source if isinstance(source, Log) and not overrides else None
         analysed = _find_end_loop(scenario, log)
     else:
-        conditions = derive_operating_conditions(scenario)
+        conditions = OperatingConditions.derive(scenario)
         analysed = _AnalysedLoop(scenario, conditions, find_equilibrium(scenario, pose))
     scenario = analysed.scenario
     conditions = analysed.conditions

@@ -36,7 +36,7 @@ from .equilibrium import (
 )
 from .floquet import compute_sampled_spectrum
 from .linear_loop import linearise_loop
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import place_arm
 
 EDGE_SCAN_POINTS = 24
@@ -135,10 +135,10 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
     try:
         # refuses imported laws, because their memory is not among the arguments
-        derive_operating_conditions(scenario, own_laws=False)
+        OperatingConditions.derive(scenario, own_laws=False)
         state = Equilibrium(q[deepest], theta_hat[deepest], "", 0.0)
         rest = follow_equilibrium(scenario, state)
-        root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
+        root = find_rightmost_root(OperatingConditions.derive(scenario), rest, sampled=True)
     except ScenarioError:
         return np.nan
     return -np.inf if root is None else root.s.real
@@ -314,7 +314,7 @@ class _GrowthRate:
         """
         typed_value = round(value) if self.takes_integers else value
         scenario = load_scenario(self._scenario, {self._key: typed_value})
-        conditions = derive_operating_conditions(scenario)
+        conditions = OperatingConditions.derive(scenario)
         self._rest = follow_equilibrium(scenario, self._rest)
         sampled = self._sampled
         if sampled is None:
@@ -379,51 +379,57 @@ class GrowthColumn(NamedTuple):
     edges: dict[int, float]
     remarks: list[str]
 
+    @classmethod
+    def compute(
+        cls,
+        scenarios: Sequence[Scenario],
+        key: str,
+        values: Sequence[float],
+    ) -> "GrowthColumn":
+        """Computes how the growth of small motions depends on one setting of a scenario.
 
-def compute_growth_column(
-    scenarios: Sequence[Scenario],
-    key: str,
-    values: Sequence[float],
-) -> GrowthColumn:
-    """Computes how the growth of small motions depends on one setting of a scenario.
+        For each value of the setting, the coupled arms are linearised about a pose of rest.
+        This pose is followed from one value to the next. Between two neighbouring values of
+        which exactly one gives an unstable loop, the value at which stability changes is
+        searched.
 
-    For each value of the setting, the coupled arms are linearised about a pose of rest. This
-    pose is followed from one value to the next. Between two neighbouring values of which
-    exactly one gives an unstable loop, the value at which stability changes is searched.
+        Args:
+            scenarios: The experiments, which differ in the setting only, by its rising value.
+            key: Name of the setting, such as "control.d".
+            values: Values of the setting, one per scenario.
 
-    Args:
-        scenarios: The experiments, which differ in the setting only, by its rising value.
-        key: Name of the setting, such as "control.d".
-        values: Values of the setting, one per scenario.
+        Returns:
+            The growth rates, and the values at which stability changes. A value of change is
+            missing if the setting does not allow the numbers that the search needs.
+        """
+        rest: Equilibrium | None = None
+        column = GrowthColumn([], {}, [])
+        for n, scenario in enumerate(scenarios):
+            try:
+                rest, remark = _assume_equilibrium(scenario, rest)
+                conditions = OperatingConditions.derive(scenario)
+                root = find_rightmost_root(
+                    conditions, rest, sampled=conditions.needs_sampled_loop
+                )
+                column.growth_per_s.append(-np.inf if root is None else root.s.real)
+                if n > 0:
+                    left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
+                    right = _GrowthPoint(values[n], column.growth_per_s[-1])
+                    is_finite = np.isfinite([left.growth_per_s, right.growth_per_s]).all()
+                    if is_finite and left.is_unstable != right.is_unstable:
+                        # evaluated again from one equilibrium, both ends may have the same sign
+                        with suppress(ScenarioError, ValueError):
+                            edge = _GrowthRate(scenario, key, rest, None).close_edge(
+                                left, right
+                            )
+                            column.edges[n - 1] = edge.value
+            except ScenarioError as error:
+                remark = f"no linear analysis: {error.problem}"
+                column.growth_per_s.append(float("nan"))
+            if remark and remark not in column.remarks:
+                column.remarks.append(remark)
 
-    Returns:
-        The growth rates, and the values at which stability changes. A value of change is
-        missing if the setting does not allow the numbers that the search needs.
-    """
-    rest: Equilibrium | None = None
-    column = GrowthColumn([], {}, [])
-    for n, scenario in enumerate(scenarios):
-        try:
-            rest, remark = _assume_equilibrium(scenario, rest)
-            conditions = derive_operating_conditions(scenario)
-            root = find_rightmost_root(conditions, rest, sampled=conditions.needs_sampled_loop)
-            column.growth_per_s.append(-np.inf if root is None else root.s.real)
-            if n > 0:
-                left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
-                right = _GrowthPoint(values[n], column.growth_per_s[-1])
-                is_finite = np.isfinite([left.growth_per_s, right.growth_per_s]).all()
-                if is_finite and left.is_unstable != right.is_unstable:
-                    # evaluated again from one equilibrium, both ends may have the same sign
-                    with suppress(ScenarioError, ValueError):
-                        edge = _GrowthRate(scenario, key, rest, None).close_edge(left, right)
-                        column.edges[n - 1] = edge.value
-        except ScenarioError as error:
-            remark = f"no linear analysis: {error.problem}"
-            column.growth_per_s.append(float("nan"))
-        if remark and remark not in column.remarks:
-            column.remarks.append(remark)
-
-    return column
+        return column
 
 
 def find_root_crossings(
@@ -470,7 +476,7 @@ def _assume_equilibrium(
         The equilibrium.
         A remark on the assumption. Empty if none was made.
     """
-    sites = derive_operating_conditions(scenario).sites
+    sites = OperatingConditions.derive(scenario).sites
     is_adaptive = any(site.gains.law is Law.ADAPTIVE for site in sites)
     has_actors = any(site.actors for site in sites)
     if is_adaptive and not has_actors:

@@ -46,11 +46,7 @@ from .equilibrium import follow_equilibrium, pad_rows, settle_memories
 from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
 from .linear_edge import find_deepest_contact
 from .linear_loop import linearise_loop
-from .operating_point import (
-    Equilibrium,
-    OperatingConditions,
-    derive_operating_conditions,
-)
+from .operating_point import Equilibrium, OperatingConditions
 
 _SAME_POSE_RAD = 1e-6
 """Poses that differ by less have the same roots, in rad."""
@@ -324,7 +320,7 @@ def _build_end_loop(
     Raises:
         ScenarioError: The loop cannot be linearised, or has no equilibrium near the state.
     """
-    conditions = derive_operating_conditions(final.scenario, own_laws=own_laws)
+    conditions = OperatingConditions.derive(final.scenario, own_laws=own_laws)
     for pair, age_s in final.mean_age_s.items():
         conditions.age_s[pair] = age_s
     end = Equilibrium(state.q, state.estimates, state.how, 0.0)

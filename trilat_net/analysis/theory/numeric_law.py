@@ -31,9 +31,9 @@ import numpy as np
 from ...core import (
     Array,
     LawContext,
+    SiteArrays,
     SiteSetup,
     UserLaw,
-    build_site_arrays,
     chain_stages,
     list_remembered,
     plug_law,
@@ -92,7 +92,7 @@ class NumericLaw:
         assert setup.law_factory is not None
         self._law = setup.law_factory(setup.law_context())
         self._layout = setup.layout
-        self._arrays = build_site_arrays(setup)
+        self._arrays = SiteArrays.build(setup)
         self._rate_hz = setup.rate_hz
         self._arrays.site["tau_limit"] = np.inf
         self._arrays.links["alpha"] = shares

@@ -40,7 +40,7 @@ from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, compute_delay_spectrum
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .port_passivity import (
     EIGENVALUE_ROUNDING,
     HandMatrices,
@@ -300,7 +300,7 @@ def analyse_ports(
             f"not from {low:g} to {high:g} Hz"
         )
 
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     loop = linearise_teleoperator(conditions, rest)
     other_site = of or scenario.slave
 

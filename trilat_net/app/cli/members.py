@@ -181,7 +181,7 @@ def record_command(
     from sites import check_machine_load
 
     from ...files import refuse_existing
-    from ...log import LogStorage, collect_provenance, find_parts, parse_channel_filter
+    from ...log import ChannelFilter, LogStorage, collect_provenance, find_parts
     from ...net import RECORDER
     from ..recorded_session import make_scenario_reader
     from .options import parse_viz_rate
@@ -196,7 +196,7 @@ def record_command(
         split_bytes=parse_split("--split-size", "MiB", split_size, 1 << 20),
         split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
         carry_on=carry_on,
-        choice=parse_channel_filter(include or [], exclude or []),
+        choice=ChannelFilter.parse(include or [], exclude or []),
     )
     read_scenario = make_scenario_reader(parse_viz_rate(views))
 
@@ -636,18 +636,11 @@ def router_command(
     router is restarted. Routers that are connected to each other with --connect act as one
     router.
     """
-    from ...net import (
-        ROUTER,
-        open_bus,
-        read_zenoh_file,
-        resolve_member_connection,
-        run_router,
-        secure_connection,
-    )
+    from ...net import ROUTER, Connection, read_zenoh_file, run_router
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     default_listen = [LOOPBACK if keys is None else ANY_ADDRESS]
-    open_connection = resolve_member_connection(
+    open_connection = Connection.of_member(
         listen=listen,
         connect=connect,
         routers=None,
@@ -656,7 +649,7 @@ def router_command(
         connect_else=(),
         routes=True,
     )
-    secured = secure_connection(open_connection, keys, insecure=insecure)
+    secured = open_connection.secure(keys, insecure=insecure)
     connection = secured.require(ROUTER)
     expiry = connection.describe_end()
     if expiry:
@@ -664,8 +657,7 @@ def router_command(
 
     clock = SystemClock()
     with Interrupt() as interrupt:
-        bus = open_bus(
-            connection=connection,
+        bus = connection.open_bus(
             clock=clock,
             stopped=interrupt.is_requested,
             timeout_s=None,

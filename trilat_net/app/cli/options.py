@@ -558,10 +558,10 @@ class MemberOptions(NamedTuple):
             listen_else: Addresses at which to listen if the options state none.
             connect_else: Addresses to which to connect if the options state none.
         """
-        from ...net import read_zenoh_file, resolve_member_connection
+        from ...net import Connection, read_zenoh_file
 
         file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
-        return resolve_member_connection(
+        return Connection.of_member(
             listen=self.listen,
             connect=self.connect,
             routers=self.router,
@@ -587,15 +587,13 @@ class MemberOptions(NamedTuple):
             stops: True if the connection only serves to stop arms. Expired keys are then
                 accepted, and no note is printed.
         """
-        from ...net import secure_connection
-
         connection = self.find_endpoints(listen_else, connect_else)
         keys: Any = self.keys
         if stops and keys is not None:
             from ...net import read_member_keys
 
             keys = read_member_keys(keys, stops=True)
-        secured = secure_connection(connection, keys, insecure=self.insecure)
+        secured = connection.secure(keys, insecure=self.insecure)
         expiry = secured.describe_end()
         # A user who stops an arm in a hurry does not read notes.
         if expiry and not stops:

@@ -37,7 +37,6 @@ from ...log import (
     McapMessage,
     McapReader,
     Progress,
-    parse_channel_filter,
 )
 from ...net import number_message
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
@@ -130,7 +129,7 @@ def parse_selection(
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
     return PlaySelection(
-        channels=parse_channel_filter(include, exclude),
+        channels=ChannelFilter.parse(include, exclude),
         start_ns=None if start_s is None else round(start_s * NS_PER_S),
         stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
         time=cast(PlayTime, time),

@@ -99,6 +99,65 @@ class SiteArrays(NamedTuple):
     chain: RowArray | None
     channel: ChannelArrays | None
 
+    @classmethod
+    def build(
+        cls,
+        setup: SiteSetup,
+        spare: tuple[int, int] = (0, 0),
+        pages: int = 0,
+        layout: Layout | None = None,
+        *,
+        plugged: bool = False,
+    ) -> "SiteArrays":
+        """Creates the arrays of a site (the process of one arm) before its first period.
+
+        Args:
+            setup: Setup of the site.
+            spare: Two numbers of free rows for changes during the run: for changes of each
+                link's delay model, and for changes of the weights with which the site follows
+                the other sites.
+            pages: Number of samples that can wait on each link, which is also the number of
+                delivery times that each link stores. 0 to derive both numbers from the setup.
+            layout: Lengths of the vectors in the arrays, if they are larger than this site
+                needs.
+            plugged: True to include the arrays of a user's control law, even if this site has
+                none.
+        """
+        links = setup.links
+        layout = layout or setup.layout
+        peers = len(links)
+        spare_models, spare_ramps = spare
+        kept_dues = pages or _count_kept_dues(setup)
+        pages = pages or needed_pages(setup)
+        calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
+        calendars["tick"] = -1
+        rows, models, points = _build_links(links, spare_models, layout.shared)
+        axes = 3 if layout.chain else 2
+        actors, table = torque_source_rows(setup.actors, layout.joints, axes)
+        ramp_count = 1 + len(setup.ramps) + spare_ramps
+        ramps = np.zeros((ramp_count, RAMP_COLUMNS + peers))
+        ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
+        chain = None
+        if setup.chain is not None:
+            chain = build_chain(setup.chain.joints, layout.joints)
+        has_channel = plugged or setup.law_factory is not None
+        arrays = SiteArrays(
+            site=_build_site(setup, layout),
+            links=rows,
+            models=models,
+            dues=np.full((peers, kept_dues), LOST, dtype=np.int64),
+            calendars=calendars,
+            points=points,
+            ramps=ramps,
+            actors=actors,
+            table=table,
+            chain=chain,
+            channel=_build_channel(setup, pages) if has_channel else None,
+        )
+        for ramp in setup.ramps:
+            _add_ramp(arrays, ramp)
+        return arrays
+
 
 class TickBuffers(NamedTuple):
     """Input and output of one period of the control loop.
@@ -140,62 +199,6 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
         sent=np.zeros((MAX_ARRIVALS, largest_received)),
         record=np.zeros(layout.floats),
     )
-
-
-def build_site_arrays(
-    setup: SiteSetup,
-    spare: tuple[int, int] = (0, 0),
-    pages: int = 0,
-    layout: Layout | None = None,
-    *,
-    plugged: bool = False,
-) -> SiteArrays:
-    """Creates the arrays of a site (the process of one arm) before its first control period.
-
-    Args:
-        setup: Setup of the site.
-        spare: Two numbers of free rows for changes during the run: for changes of each link's
-            delay model, and for changes of the weights with which the site follows the other
-            sites.
-        pages: Number of samples that can wait on each link, which is also the number of
-            delivery times that each link stores. 0 to derive both numbers from the setup.
-        layout: Lengths of the vectors in the arrays, if they are larger than this site needs.
-        plugged: True to include the arrays of a user's control law, even if this site has none.
-    """
-    links = setup.links
-    layout = layout or setup.layout
-    peers = len(links)
-    spare_models, spare_ramps = spare
-    kept_dues = pages or _count_kept_dues(setup)
-    pages = pages or needed_pages(setup)
-    calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
-    calendars["tick"] = -1
-    rows, models, points = _build_links(links, spare_models, layout.shared)
-    axes = 3 if layout.chain else 2
-    actors, table = torque_source_rows(setup.actors, layout.joints, axes)
-    ramp_count = 1 + len(setup.ramps) + spare_ramps
-    ramps = np.zeros((ramp_count, RAMP_COLUMNS + peers))
-    ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
-    chain = None
-    if setup.chain is not None:
-        chain = build_chain(setup.chain.joints, layout.joints)
-    has_channel = plugged or setup.law_factory is not None
-    arrays = SiteArrays(
-        site=_build_site(setup, layout),
-        links=rows,
-        models=models,
-        dues=np.full((peers, kept_dues), LOST, dtype=np.int64),
-        calendars=calendars,
-        points=points,
-        ramps=ramps,
-        actors=actors,
-        table=table,
-        chain=chain,
-        channel=_build_channel(setup, pages) if has_channel else None,
-    )
-    for ramp in setup.ramps:
-        _add_ramp(arrays, ramp)
-    return arrays
 
 
 def needed_pages(setup: SiteSetup) -> int:
@@ -516,7 +519,7 @@ def stack_site_arrays(
     largest = Layout(*map(max, lengths_by_field))
     plugged = any(setup.law_factory is not None for setup in setups)
     sites = [
-        build_site_arrays(setup, (spare, spare), pages, largest, plugged=plugged)
+        SiteArrays.build(setup, (spare, spare), pages, largest, plugged=plugged)
         for setup in setups
     ]
     _share_tables(sites)

@@ -34,7 +34,6 @@ from ...log import (
     list_full_topics,
     make_session_name,
     pack_session_diagnostics,
-    read_topic_table,
     ros2_messages,
 )
 from ...records import NS_PER_S
@@ -85,7 +84,7 @@ def export_ros2(
         UsageError: The names cannot be read.
         OSError: The disk refused the data.
     """
-    table = read_topic_table(names)
+    table = TopicTable.read(names)
     log_session = log.session.get("session", "") or log.scenario.name
     session = make_session_name(log_session)
     with path.open("wb") as stream:

@@ -24,7 +24,7 @@ from ...analysis import PushedTwins, TwinGrowth
 from ...errors import UsageError, suggest_nearest
 from ...files import make_folder, refuse_existing
 from ...log import Log, Progress, open_log
-from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
+from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize
 from ..style import FIGURE_FORMATS, write_figure
 from .figure_entry import FigureEntry, list_figures
 from .joint_motion import draw_operator_displacement
@@ -58,7 +58,7 @@ def figure(
         UsageError: The figure or the width does not exist, or the log has nothing to show in
             the figure.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     opened = log if isinstance(log, Log) else open_log(log)
     return _find_figure(opened, name).draw(opened, form)
 
@@ -102,7 +102,7 @@ def write_figures(
         UsageError: A figure, the width or a format does not exist, the log has nothing to show
             in a figure, or a file exists.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     unique_names = list(dict.fromkeys(names))
     drawings: dict[str, Callable[[], Figure]] = {}
     for name in unique_names or list_drawable_figures(log):
@@ -141,7 +141,7 @@ def write_overlay(
         UsageError: The width or a format does not exist, the errors of the logs have different
             units, or a file exists.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     drawings = {"overlay": partial(draw_overlay, logs, form)}
     return _write(drawings, folder, form, formats, force=force)
 

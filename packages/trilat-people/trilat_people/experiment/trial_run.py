@@ -25,10 +25,10 @@ from msgspec.structs import replace
 from trilat_net.analysis import (
     AlignedRecords,
     EndEffectorRows,
+    TorqueSplit,
     align_records,
     build_arm_rows,
     sample_ages_ns,
-    split_torque,
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
@@ -352,7 +352,7 @@ class ExperimentTrial:
         forces: list[Array] = []
         for number, user in enumerate(users, 1):
             records = aligned[user]
-            split = split_torque(records, log.scenario)
+            split = TorqueSplit.of_records(records, log.scenario)
             end_effector = split.end_effector
             is_in_trial = records.t_s <= outcome.ended_s
             # The force of the hand ON its arm, shape (K, 2) or (K, 3).

@@ -47,7 +47,6 @@ from trilat_net.net import (
     SiteSender,
     decode,
     encode,
-    make_hand_sender,
     topics,
 )
 
@@ -494,7 +493,7 @@ class PageHands:
         if site not in self._senders:
             if not order.grip:
                 return
-            new_sender = make_hand_sender(self._bus, self._clock, self._session, site)
+            new_sender = SiteSender.for_hand(self._bus, self._clock, self._session, site)
             new_sender.number = 0  # the messages of a page are numbered from 1
             self._senders[site] = new_sender
         sender = self._senders[site]

@@ -33,7 +33,6 @@ from trilat_net.analysis import (
     build_arm_rows,
     joint_positions_m,
     list_walls,
-    split_torque,
     upright_axes,
     wall_force,
 )
@@ -206,7 +205,7 @@ class _ArmFrames:
             synchronisation error, torque of a joint in N m, force of people in N, and force of
             the walls in N.
         """
-        split = split_torque(records, self._scenario)
+        split = TorqueSplit.of_records(records, self._scenario)
         hand_force = self._compute_hand_force(records, split)
         wall_force_n = self._compute_wall_force(records, split)
         error_norm = np.linalg.norm(records.e, axis=1)

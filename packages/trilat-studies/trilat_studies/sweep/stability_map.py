@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.analysis import GrowthColumn, PlacedArm, compute_growth_column
+from trilat_net.analysis import GrowthColumn, PlacedArm
 from trilat_net.core import Array
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive, find_least_reversible
@@ -1257,7 +1257,7 @@ def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
     """
     load, x, y = task
     scenarios = [load(x, y_value) for y_value in y.values]
-    return compute_growth_column(scenarios, y.key, y.values)
+    return GrowthColumn.compute(scenarios, y.key, y.values)
 
 
 def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:

@@ -36,7 +36,6 @@ from trilat_net.scenario import (
     apply_overrides,
     identify_law,
     is_number,
-    read_experiment,
 )
 
 from ..run_commands import format_command, format_toml_value, set_options
@@ -488,7 +487,7 @@ def plan_sweep(
         ScenarioError: The scenario, an axis or a value of an axis is not valid or cannot run.
         UsageError: Another argument is not valid.
     """
-    written = read_experiment(source)
+    written = ExperimentText.read(source)
     texts = tuple(overrides)
     axes = tuple(map(parse_axis, list_axes(over)))
     law_list = [laws] if isinstance(laws, str | type) else laws

@@ -34,7 +34,7 @@ from trilat_net.execution import RunTotals
 from trilat_net.files import write_whole
 from trilat_net.results import Result
 from trilat_net.scenario import read_source
-from trilat_net.work import MeanInterval, encode_csv, mean_interval, wilson_interval
+from trilat_net.work import MeanInterval, encode_csv, wilson_interval
 
 from ..run_commands import format_command, set_options
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
@@ -473,7 +473,7 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
         means = []
         for key in totals:
             values = [row.get(key) for row in rows_within_limits]
-            means.append(mean_interval(values))
+            means.append(MeanInterval.of_values(values))
         class_counts = [counts[verdict.value] for verdict in CellClass]
         point = GridPoint(
             cell=cell,

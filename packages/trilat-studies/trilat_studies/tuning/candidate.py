@@ -68,9 +68,8 @@ from trilat_net.scenario import (
     Scenario,
     Wall,
     parse_scenario,
-    read_experiment,
 )
-from trilat_net.work import mean_interval
+from trilat_net.work import MeanInterval
 
 from ..measure_run import RecordBatch, refuse_live_only, run_whole
 from ..run_commands import format_command, format_toml_value, set_options
@@ -471,7 +470,7 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
     means = {}
     for field in _AVERAGED:
         values = [getattr(score, field) for score in scores]
-        interval = mean_interval(values)
+        interval = MeanInterval.of_values(values)
         intervals[field] = interval
         means[field] = None if interval is None else interval.mean
     error = intervals["error_rad"]
@@ -862,6 +861,6 @@ def load_tuning_scenario(
     Raises:
         ScenarioError: The scenario does not exist, or is not valid with the overrides.
     """
-    experiment = read_experiment(source)
+    experiment = ExperimentText.read(source)
     scenario = experiment.load(overrides)
     return TuningScenario(experiment, tuple(overrides), scenario)
