@@ -90,7 +90,7 @@ def scale_differences(x: Array, y: Array, factor: float) -> Array:
     return np.where(np.isfinite(mixed), mixed, y)
 
 
-class RunState:
+class _RunState:
     """All arrays that change during a run, viewed as 64-bit integers.
 
     A run creates one object, with which its state can be copied to another run, or mixed with
@@ -113,7 +113,7 @@ class RunState:
             self._bits.append(flat)
             self._floats.append(np.tile(mark_floats(array.dtype), array.size))
 
-    def scale_difference(self, other: "RunState", factor: float) -> None:
+    def scale_difference(self, other: "_RunState", factor: float) -> None:
         """Multiplies the difference between this state and another one by a factor.
 
         Every floating-point number x of this state becomes x_other + factor (x - x_other). With
@@ -171,7 +171,7 @@ def _find_largest_ratio(scenario: Scenario) -> int:
     return math.ceil(max(rates_hz) / min(rates_hz))
 
 
-class HandActor(Protocol):
+class _HandActor(Protocol):
     """Interface of a live operator in a compiled run.
 
     A live operator is a person or program that moves an arm while the run is in progress. The
@@ -326,7 +326,7 @@ class FusedRun:
         settled_rad: float = 0.01,
         keep: int = 0,
         inputs: RunInputs | None = None,
-        hands: Mapping[str, HandActor] = {},
+        hands: Mapping[str, _HandActor] = {},
         plants: Mapping[str, PlantPlayer] = {},
     ) -> None:
         check_fusable(scenario, plants)
@@ -338,7 +338,7 @@ class FusedRun:
         self.scenario = scenario
         self._settled_rad = settled_rad
         self._inputs = inputs or _make_prompt_inputs(count)
-        self._hands: dict[int, HandActor] = {}
+        self._hands: dict[int, _HandActor] = {}
         if inputs is None:
             self._connect_hands({**make_hand_players(scenario), **hands}, setups)
         self._changes = deque(self._inputs.changes)
@@ -397,7 +397,7 @@ class FusedRun:
         )
 
     def _connect_hands(
-        self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]
+        self, hands: Mapping[str, _HandActor], setups: Sequence[SiteSetup]
     ) -> None:
         """Connects live operators to their sites, and allocates memory for their actions.
 
@@ -734,7 +734,7 @@ class FusedRun:
             self._inputs = self._inputs._replace(feed=feed._replace(hands=actions))
 
     @cached_property
-    def _state(self) -> RunState:
+    def _state(self) -> _RunState:
         """All arrays of the run that change while it is executed."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
@@ -743,7 +743,7 @@ class FusedRun:
             arrays += tables.channel
         if self._law_arrays is not None:
             arrays += [self._law_arrays.rows, self._law_arrays.sent]
-        return RunState(arrays)
+        return _RunState(arrays)
 
     @property
     def has_programs(self) -> bool:
@@ -766,7 +766,7 @@ class FusedRun:
         """Multiplies the difference between the states of this run and another run by a factor.
 
         Every floating-point number x of the state becomes x_other + factor (x - x_other), see
-        `RunState.scale_difference`. This is not possible if operators or arms are users'
+        `_RunState.scale_difference`. This is not possible if operators or arms are users'
         programs, because the state of such programs is not known.
 
         Args:

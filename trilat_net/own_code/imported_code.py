@@ -93,7 +93,7 @@ class NamedCode(Protocol):
         """Arguments by name with which an object of the user's class is created."""
 
 
-class SiteWithCode(Protocol):
+class _SiteWithCode(Protocol):
     """Interface of a site of a scenario whose parts may be classes of users.
 
     These parts are its control law, its operators and its plant. The checks of permissions look
@@ -117,7 +117,7 @@ class ScenarioWithCode(Protocol):
     """Interface of a scenario, the description of an experiment, that may name classes."""
 
     @property
-    def sites(self) -> Mapping[str, SiteWithCode]:
+    def sites(self) -> Mapping[str, _SiteWithCode]:
         """The sites, each of which is a process that controls one arm, by name."""
 
 
