@@ -40,7 +40,7 @@ from trilat_net.net import (
     read_messages,
     topics,
 )
-from trilat_net.scenario import HandSite, Scenario, find_own_hand, make_hand_program
+from trilat_net.scenario import HandSite, Scenario, make_hand_program
 from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
@@ -210,7 +210,7 @@ def run_hand(
         SessionError: The site does not send its state in time.
         RunFailed: The class failed.
     """
-    hand_site = find_own_hand(scenario, name)
+    hand_site = HandSite.find(scenario, name)
     if hand_site is None or not hand_site.has_separate_process:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 
 from trilat_net.core import (
+    LifeAlarm,
     LifeReason,
     StaleAction,
     describe_mode,
-    find_alarm,
     find_life_reason,
     tick_ns,
 )
@@ -135,7 +135,7 @@ class SiteNews:
         if rule.degrades and mode is Mode.RETURN:
             lost_peers = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
 
-        alarm = find_alarm(
+        alarm = LifeAlarm.find(
             session=parts.options.session,
             site=parts.name,
             mode=MODE_WORDS[mode],

@@ -46,10 +46,10 @@ from trilat_net.recorded_change import SiteOrder
 from trilat_net.records import Arrival, TickRecord
 from trilat_net.scenario import (
     HandPlayer,
+    HandSite,
     OwnPlant,
     PlantPlayer,
     Scenario,
-    find_own_hand,
     make_hand_program,
     make_site_order,
     to_core_change,
@@ -258,7 +258,7 @@ class SiteParts:
         if live_hand is None:
             return
 
-        own_hand = find_own_hand(self.scenario, name)
+        own_hand = HandSite.find(self.scenario, name)
         if own_hand is not None and not own_hand.has_separate_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
             self.hand = HandPlayer(own_hand, make_hand_program(own_hand), run_hand)

@@ -23,6 +23,7 @@ annotations of arguments, fields and results. Expressions of unknown class are n
 """
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -113,7 +114,8 @@ def _names_in(node: ast.AST) -> Iterator[str]:
         if isinstance(below, ast.Name):
             yield below.id
         elif isinstance(below, ast.Constant) and isinstance(below.value, str):
-            yield below.value
+            # an annotation in quotes, as a class method of a result has
+            yield from re.findall(r"\w+", below.value)
 
 
 def _resolve(path: Path, name: str) -> list[Place]:

@@ -18,7 +18,7 @@ from trilat_net.net.requests import HandMessage
 from trilat_net.net.topics import HAND, key
 from trilat_net.net.wire import encode
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.program_hand import HandSite, find_own_hand
+from trilat_net.scenario.operators.program_hand import HandSite
 
 from .relay import RelayClock
 from .sessions import SESSION, Session
@@ -36,7 +36,7 @@ def at_m2(kind: str, **keys: Any) -> Scenario:
 
 def begin(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
     """Returns a session whose hand at m2 runs in a process of its own."""
-    at = find_own_hand(scenario, "m2")
+    at = HandSite.find(scenario, "m2")
     assert at is not None
     return at, Session.whole(scenario, folder)
 
@@ -58,7 +58,7 @@ def add_program(
     """Adds a program at m2 in a process of its own, which computes for a time over each view."""
 
     def run(clock: RelayClock) -> None:
-        at = find_own_hand(session.scenario, "m2")
+        at = HandSite.find(session.scenario, "m2")
         assert at is not None
         thinking = Thinking(program, clock, thinks_ns)
         with HandProcess(at, thinking, session.network.join(), clock, SESSION) as hand:

@@ -21,7 +21,6 @@ __all__ = [
     "RunTrace",
     "Stability",
     "certify_run",
-    "classify_log_end",
     "find_hanging_sites",
     "judge_virtual_run",
     "reduce_to_buckets",
@@ -41,7 +40,6 @@ __all__ = [
     "certify",
     "explain_no_functional",
     "find_unjudged_spans",
-    "observe_energies",
     # Twins
     "MOST_LOG",
     "EnvelopeTrend",
@@ -147,7 +145,6 @@ if TYPE_CHECKING:
         NEGATIVE_ENERGY_MEANING,
         ObservedEnergy,
         ObservedFinding,
-        observe_energies,
     )
     from .certificate.premises import Premise, explain_no_functional, find_unjudged_spans
     from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
@@ -182,7 +179,6 @@ if TYPE_CHECKING:
         RunEnd,
         RunTrace,
         Stability,
-        classify_log_end,
         find_hanging_sites,
         reduce_to_buckets,
     )
@@ -247,7 +243,7 @@ else:
             "body_turns": "BodyTurns",
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
             "certificate.observed_energy": (
-                "NEGATIVE_ENERGY_MEANING ObservedEnergy ObservedFinding observe_energies"
+                "NEGATIVE_ENERGY_MEANING ObservedEnergy ObservedFinding"
             ),
             "certificate.premises": "Premise explain_no_functional find_unjudged_spans",
             "certificate.running_energy": "EnergyCourse KEPT_S RecordWindow RunningEnergy",
@@ -268,7 +264,7 @@ else:
             "metrics.motion_metrics": "measure_undelayed_error",
             "run_end": (
                 "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
-                "classify_log_end find_hanging_sites reduce_to_buckets"
+                "find_hanging_sites reduce_to_buckets"
             ),
             "run_view": "RunView",
             "site_signals": (

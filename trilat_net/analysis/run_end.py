@@ -260,6 +260,27 @@ class RunEnd(NamedTuple):
         rates = f"|e| {self.error.rate_text}, |qd| {self.speed.rate_text}"
         return f"{behaviour.value}{joint} ({rates}): {end}"
 
+    @classmethod
+    def of_log(cls, log: Log) -> "RunEnd":
+        """Judges from a log whether the motion died away at the end of the run.
+
+        A log that is torn or empty leaves the end undecided. If the run ends in a bounded
+        oscillation, its frequency is computed too.
+
+        Args:
+            log: The log of the run.
+        """
+        end = trace_log(log).classify_end(log.scenario)
+        error = find_last_error(log)
+        if error is not None:
+            end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
+        if end.behaviour is EndBehaviour.DIVERGED:
+            return end._replace(divergence=log.describe_divergence())
+        if end.behaviour is not EndBehaviour.BOUNDED:
+            return end
+        parts = [log[site] for site in log.sites]
+        return end._replace(frequency_hz=_find_frequency_hz(parts))
+
 
 class RunTrace(NamedTuple):
     """The reduced data from which the end of a run is judged, per site in scenario order.
@@ -460,27 +481,6 @@ def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
     if len(part) and part.layout.hand:
         pushed |= part.hand[:, 0] > 0.0
     return float(part.t_s[pushed].max(initial=0.0))
-
-
-def classify_log_end(log: Log) -> RunEnd:
-    """Judges from a log whether the motion died away at the end of the run.
-
-    A log that is torn or empty leaves the end undecided. If the run ends in a bounded
-    oscillation, its frequency is computed too.
-
-    Args:
-        log: The log of the run.
-    """
-    end = trace_log(log).classify_end(log.scenario)
-    error = find_last_error(log)
-    if error is not None:
-        end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
-    if end.behaviour is EndBehaviour.DIVERGED:
-        return end._replace(divergence=log.describe_divergence())
-    if end.behaviour is not EndBehaviour.BOUNDED:
-        return end
-    parts = [log[site] for site in log.sites]
-    return end._replace(frequency_hz=_find_frequency_hz(parts))
 
 
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:

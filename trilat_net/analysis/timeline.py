@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..core import HELD_OVERRUN_TICKS, find_alarm
+from ..core import HELD_OVERRUN_TICKS, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log, SiteLog
 from ..net import MODES, ModeMeaning
@@ -307,7 +307,7 @@ def list_alarms(log: Log) -> list[_RaisedAlarm]:
         part = log[site]
         for mode, from_s, to_s in find_mode_intervals(part):
             state = part.states[int(np.searchsorted(part.t_s, from_s))]
-            alarm = find_alarm(
+            alarm = LifeAlarm.find(
                 session=log.scenario.name,
                 site=site,
                 mode=mode,

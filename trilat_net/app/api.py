@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..analysis import Certificate, LogMetrics, compute_log_metrics
 from ..entry_points import find_viewer
 from ..errors import UsageError
-from ..execution import LogCheckReport, SimulatedLog, run_log_checks, simulate_scenario
+from ..execution import LogCheckReport, SimulatedLog, simulate_scenario
 from ..files import make_results_folder
 from ..log import MIN_COVERAGE, Log, open_log, open_logs
 from ..scenario import Scenario, load_scenario
@@ -137,7 +137,7 @@ def verify(
     Raises:
         LogError: The log cannot be read.
     """
-    return run_log_checks(
+    return LogCheckReport.of_log(
         _open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every
     )
 

@@ -49,7 +49,7 @@ from ..log import Log, open_log
 from ..net import Clock, SystemClock, ZenohBus, reserve_session_endpoints
 from ..own_code import list_imported_code
 from ..records import NS_PER_S
-from ..scenario import check_outside_arms, find_own_hand
+from ..scenario import HandSite, check_outside_arms
 from .monitor import SessionDisplay, SessionMonitor
 
 POLL_NS = 100_000_000
@@ -459,7 +459,7 @@ def _needs_hand_process(scenario: Scenario, site: str) -> bool:
         scenario: The scenario.
         site: Name of the site.
     """
-    own_hand = find_own_hand(scenario, site)
+    own_hand = HandSite.find(scenario, site)
     return own_hand is not None and own_hand.has_separate_process
 
 

@@ -30,7 +30,6 @@ __all__ = [
     "TickInput",
     "describe_divergence",
     "describe_mode",
-    "find_alarm",
     "find_life_reason",
     "first_tick_at",
     "tick_ns",
@@ -59,8 +58,6 @@ __all__ = [
     "links_bytes",
     "make_layout",
     "needed_pages",
-    "select_site",
-    "stack_site_arrays",
     # Numbers and vectors
     "Array",
     "IntArray",
@@ -419,8 +416,6 @@ if TYPE_CHECKING:
         apply_change,
         links_bytes,
         needed_pages,
-        select_site,
-        stack_site_arrays,
     )
     from .step.site_setup import (
         ChainSetup,
@@ -449,7 +444,6 @@ if TYPE_CHECKING:
         TickInput,
         describe_divergence,
         describe_mode,
-        find_alarm,
         find_life_reason,
         first_tick_at,
         tick_ns,
@@ -547,7 +541,7 @@ else:
             "step.row_fields": "LinkRow",
             "step.site_arrays": (
                 "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays apply_change links_bytes "
-                "needed_pages select_site stack_site_arrays"
+                "needed_pages"
             ),
             "step.site_setup": (
                 "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
@@ -557,7 +551,7 @@ else:
             "step.ticks": (
                 "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
                 "MAX_ARRIVALS PlantState TickInput describe_divergence describe_mode "
-                "find_alarm find_life_reason first_tick_at tick_ns"
+                "find_life_reason first_tick_at tick_ns"
             ),
             "step.vectors": (
                 "Array IntArray Pair Points Row RowArray Vector choose five pair put_pair "

@@ -29,7 +29,6 @@ __all__ = [
     "check_log_files",
     "describe_rerun_changes",
     "rerun",
-    "run_log_checks",
     "verify",
     # Twins
     "LEAST_PUSH",
@@ -44,7 +43,7 @@ __all__ = [
 if TYPE_CHECKING:
     from .fused import FusedRun, RunTotals, check_fusable, explain_not_repeatable
     from .lanes.run_groups import LEAST_RUNS, RunGroup, group_runs
-    from .log_checks import LogCheckReport, check_log_files, run_log_checks
+    from .log_checks import LogCheckReport, check_log_files
     from .rerun_execution import describe_rerun_changes
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .verification import verify
@@ -63,7 +62,7 @@ else:
         {
             "fused": "FusedRun RunTotals check_fusable explain_not_repeatable",
             "lanes.run_groups": "LEAST_RUNS RunGroup group_runs",
-            "log_checks": "LogCheckReport check_log_files run_log_checks",
+            "log_checks": "LogCheckReport check_log_files",
             "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "verification": "verify",

@@ -50,9 +50,7 @@ from ..core import (
     max_over_joints,
     plug_law,
     run_until,
-    select_site,
     sense_site,
-    stack_site_arrays,
     sums_dtype,
     tick_ns,
 )
@@ -342,7 +340,7 @@ class FusedRun:
         if inputs is None:
             self._connect_hands({**make_hand_players(scenario), **hands}, setups)
         self._changes = deque(self._inputs.changes)
-        self._tables = stack_site_arrays(
+        self._tables = SiteArrays.stack(
             setups, len(self._changes), self._inputs.longest_us, self._inputs.late_ns
         )
         self._layouts = [setup.layout for setup in setups]
@@ -448,7 +446,7 @@ class FusedRun:
         sent = np.zeros((site_count, most_sent_numbers))
         for i, setup in enumerate(setups):
             if setup.law_factory is not None:
-                arrays = select_site(self._tables, i, setup.layout)
+                arrays = self._tables.select(i, setup.layout)
                 law = setup.law_factory(setup.law_context())
                 sent_by_law = sent[i, : setup.channel.record_size]
                 self._laws[i] = plug_law(law, setup, arrays, sent_by_law)
@@ -800,7 +798,7 @@ class FusedRun:
         """
         self._update_links()
         if i not in self._selected:
-            self._selected[i] = select_site(self._tables, i, self._layouts[i])
+            self._selected[i] = self._tables.select(i, self._layouts[i])
         return self._selected[i]
 
     def displace(self, field: str, offsets: Array) -> None:

@@ -27,7 +27,6 @@ __all__ = [
     "read_contents",
     "read_link_delays",
     "shift_progress",
-    "to_data_frame",
     # Writing a log
     "FULL_RATE_HZ",
     "VIZ_HZ",
@@ -105,7 +104,6 @@ __all__ = [
     "TopicTable",
     "build_rviz_config",
     "cdr",
-    "is_robot_description",
     "list_full_topics",
     "make_session_name",
     "pack_event",
@@ -123,7 +121,7 @@ if TYPE_CHECKING:
         StartGap,
         describe_unknown_ends,
     )
-    from .data_tables import UNIT_SUFFIXES, Column, Table, to_data_frame
+    from .data_tables import UNIT_SUFFIXES, Column, Table
     from .findings import CheckReport, Finding
     from .log_file import LogFile
     from .log_layout import (
@@ -186,7 +184,6 @@ if TYPE_CHECKING:
         SESSION_CHANNELS,
         Ros2Channel,
         Ros2SiteChannels,
-        is_robot_description,
         pack_event,
         read_ros2_channels,
     )
@@ -209,7 +206,7 @@ else:
         __name__,
         {
             "accounting": "Account Coverage LAST MIN_COVERAGE StartGap describe_unknown_ends",
-            "data_tables": "Column Table UNIT_SUFFIXES to_data_frame",
+            "data_tables": "Column Table UNIT_SUFFIXES",
             "findings": "CheckReport Finding",
             "log_file": "LogFile",
             "log_layout": (
@@ -242,8 +239,7 @@ else:
             "ros2.robot_model": "SPACING_M WORLD",
             "ros2.ros2_messages": (
                 "EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channel Ros2SiteChannels "
-                "SENT_PREFIX SESSION_CHANNELS is_robot_description pack_event "
-                "read_ros2_channels ros2_messages"
+                "SENT_PREFIX SESSION_CHANNELS pack_event read_ros2_channels ros2_messages"
             ),
             "ros2.rviz_config": "build_rviz_config",
             "ros2.topic_names": (

@@ -172,6 +172,27 @@ class Table:
         """Name of the table for file names, such as "m1_link", or "events" for all sites."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
+    def to_data_frame(self) -> "polars.DataFrame":
+        """Converts a table of a log to a polars data frame with the same columns.
+
+        A missing value is null.
+
+        Raises:
+            UsageError: polars is not installed.
+        """
+        pl = import_extra("polars", "frames", "data frames")
+        all_series = []
+        for column in self.columns:
+            if column.is_text:
+                series = pl.Series(column.name, column.values.tolist(), pl.String)
+            else:
+                series = pl.Series(column.name, column.values, None)
+            if column.known is not None:
+                null = pl.Series([None], dtype=series.dtype)
+                series = series.zip_with(pl.Series(column.known), null)
+            all_series.append(series)
+        return cast("polars.DataFrame", pl.DataFrame(all_series))
+
 
 # An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
 _FIELD = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
@@ -819,28 +840,3 @@ def to_pandas_frame(table: Table) -> "pandas.DataFrame":
         else:
             values[column.name] = column.numbers()
     return import_extra("pandas", "frames", "data frames").DataFrame(values)
-
-
-def to_data_frame(table: Table) -> "polars.DataFrame":
-    """Converts a table of a log to a polars data frame with the same columns.
-
-    A missing value is null.
-
-    Args:
-        table: The table.
-
-    Raises:
-        UsageError: polars is not installed.
-    """
-    pl = import_extra("polars", "frames", "data frames")
-    all_series = []
-    for column in table.columns:
-        if column.is_text:
-            series = pl.Series(column.name, column.values.tolist(), pl.String)
-        else:
-            series = pl.Series(column.name, column.values, None)
-        if column.known is not None:
-            null = pl.Series([None], dtype=series.dtype)
-            series = series.zip_with(pl.Series(column.known), null)
-        all_series.append(series)
-    return cast("polars.DataFrame", pl.DataFrame(all_series))

@@ -78,7 +78,6 @@ from .data_tables import (
     build_events_table,
     build_link_table,
     build_state_table,
-    to_data_frame,
     to_pandas_frame,
 )
 from .log_layout import (
@@ -914,7 +913,7 @@ class Log(Result, Mapping[str, SiteLog]):
         Raises:
             UsageError: polars is not installed.
         """
-        return to_data_frame(self.table(name, kind))
+        return self.table(name, kind).to_data_frame()
 
 
 def open_log(

@@ -31,7 +31,6 @@ from ..log import (
     STRING,
     WORLD,
     Ros2Channel,
-    is_robot_description,
 )
 from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 
@@ -265,7 +264,7 @@ def _add_arms(panels: _Panels, channels: Ros2Channels) -> str:
     topics: JsonObject = {}
     arm_count = 0
     for topic, channel in channels.items():
-        if is_robot_description(channel):
+        if channel.is_robot_description():
             arm_count += 1
             root, _, _ = topic.rpartition("/")
             site = root.rpartition("/")[2]

@@ -81,7 +81,6 @@ __all__ = [
     "ProgramHand",
     "ViscousEnvironment",
     "Wall",
-    "find_own_hand",
     "make_hand_players",
     "make_hand_program",
     "make_plant_players",
@@ -152,7 +151,6 @@ if TYPE_CHECKING:
         HandPlayer,
         HandSite,
         ProgramHand,
-        find_own_hand,
         make_hand_players,
         make_hand_program,
     )
@@ -209,8 +207,8 @@ else:
                 "Chirp DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
             ),
             "operators.program_hand": (
-                "FAILED_HAND HandPlayer HandSite POLICY ProgramHand find_own_hand "
-                "make_hand_players make_hand_program"
+                "FAILED_HAND HandPlayer HandSite POLICY ProgramHand make_hand_players "
+                "make_hand_program"
             ),
             "override": "apply_overrides split_assignment",
             "own_plant": "OwnPlant",

@@ -44,7 +44,7 @@ from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
 from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
-from ..run_end import RunEnd, classify_log_end, find_coupled_sites
+from ..run_end import RunEnd, find_coupled_sites
 from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 LEAST_LEFT_S = 5.0
@@ -924,7 +924,7 @@ def twin(
         pushes = [Push.parse(scenario, target, size, at_s) for target, size in targets]
     elif is_of_certificate:
         pushes = Push.choose(scenario)
-        end = classify_log_end(log)
+        end = RunEnd.of_log(log)
         counts_from_s = end.counts_from_s
         quiet_from_s = end.quiet_from_s
     else:

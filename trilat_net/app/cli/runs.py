@@ -147,11 +147,11 @@ def verify_command(
         resume_every: Restart each site from its records every N ticks (control periods), to
             reveal state of a control law that the records lack; default 0: never.
     """
-    from ...execution import run_log_checks
+    from ...execution import LogCheckReport
 
     log = laws.open(*files)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
-        result = run_log_checks(
+        result = LogCheckReport.of_log(
             log,
             virtual=virtual,
             progress=progress,

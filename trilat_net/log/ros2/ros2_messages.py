@@ -70,6 +70,11 @@ class Ros2Channel(NamedTuple):
     about: dict[str, str]
     latched: bool = False
 
+    def is_robot_description(self) -> bool:
+        """Returns True if the channel contains the URDF of an arm, whatever its topic is."""
+        content = self.about.get("content")
+        return self.kind == cdr.STRING and content == ROBOT_METADATA["content"]
+
 
 class StandardChannels:
     """Registers ROS 2 channels for viewers in an MCAP file, each when it is first needed.
@@ -122,16 +127,6 @@ ROBOT_CHANNELS = {
     ROBOT: Ros2Channel(cdr.STRING, ROBOT_METADATA),
     FRAMES: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
 }
-
-
-def is_robot_description(channel: Ros2Channel) -> bool:
-    """Tells whether a channel contains the URDF of an arm, whatever the name of its topic is.
-
-    Args:
-        channel: The channel, of a log, a bag or the live bridge.
-    """
-    content = channel.about.get("content")
-    return channel.kind == cdr.STRING and content == ROBOT_METADATA["content"]
 
 
 _LEVELS = {

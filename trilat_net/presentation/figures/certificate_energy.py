@@ -31,7 +31,6 @@ from ...analysis import (
     certify,
     explain_no_functional,
     find_unjudged_spans,
-    observe_energies,
 )
 from ...core import Array
 from ...log import Log
@@ -179,7 +178,7 @@ def draw_observed_energy(
 
 def _has_declared_energies(log: Log) -> bool:
     """Returns True if at least one control law of the run declares energies."""
-    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
+    observed = ObservedEnergy.of_log(log, own_laws=may_run_user_laws(log.scenario))
     return observed is not None and bool(observed.curves)
 
 
@@ -191,7 +190,7 @@ def _has_declared_energies(log: Log) -> bool:
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
     """Draws the declared energies of a log's control laws, for the registry of figures."""
-    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
+    observed = ObservedEnergy.of_log(log, own_laws=may_run_user_laws(log.scenario))
     assert observed is not None
     return draw_observed_energy(log, observed, form)
 

@@ -29,8 +29,8 @@ from ...analysis import (
     EnvelopeTrend,
     PushedTwins,
     PushGrowth,
+    RunEnd,
     TwinGrowth,
-    classify_log_end,
     measure_amplitude,
 )
 from ...core import BUCKETS_PER_S, Array
@@ -135,7 +135,7 @@ def _explain_absent_twins(log: Log) -> str:
 def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
     """Draws the differences of twins that are pushed at the start of a log's run."""
     own_laws = may_run_user_laws(log.scenario)
-    growth = TwinGrowth.of_log(log, classify_log_end(log), own_laws=own_laws)
+    growth = TwinGrowth.of_log(log, RunEnd.of_log(log), own_laws=own_laws)
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 
 

@@ -211,6 +211,28 @@ class HandSite(NamedTuple):
         rules = self.spec.make_rules(tick_rate_hz, arm)
         return OwnHand(rules, tick_rate_hz // self.rate_hz, delay_ticks, locate)
 
+    @classmethod
+    def find(cls, scenario: "Scenario", site: str) -> "HandSite | None":
+        """Finds the program that operates the arm of a site, if the scenario has one.
+
+        Args:
+            scenario: Description of the experiment.
+            site: Name of the site.
+
+        Returns:
+            The site with its program. None if no operator of the site is a program.
+        """
+        for hand in scenario.sites[site].hands:
+            if isinstance(hand, ProgramHand):
+                return HandSite(
+                    scenario=scenario,
+                    name=site,
+                    spec=hand,
+                    rate_hz=hand.rate_hz,
+                    delay_s=hand.delay_ms * 1e-3,
+                )
+        return None
+
 
 class HandPlayer:
     """Calls a program that operates an arm, and passes its actions to the site of the arm.
@@ -336,28 +358,6 @@ class HandPlayer:
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
 
-def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Finds the program that operates the arm of a site, if the scenario has one.
-
-    Args:
-        scenario: Description of the experiment.
-        site: Name of the site.
-
-    Returns:
-        The site with its program. None if no operator of the site is a program.
-    """
-    for hand in scenario.sites[site].hands:
-        if isinstance(hand, ProgramHand):
-            return HandSite(
-                scenario=scenario,
-                name=site,
-                spec=hand,
-                rate_hz=hand.rate_hz,
-                delay_s=hand.delay_ms * 1e-3,
-            )
-    return None
-
-
 def make_hand_program(hand_site: HandSite) -> HandProgram:
     """Creates the program that operates the arm of a site, an instance of the user's class.
 
@@ -397,7 +397,7 @@ def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
     """
     players = {}
     for name in scenario.names:
-        hand_site = find_own_hand(scenario, name)
+        hand_site = HandSite.find(scenario, name)
         if hand_site is not None:
             players[name] = HandPlayer(hand_site, make_hand_program(hand_site))
     return players

@@ -25,7 +25,7 @@ import msgspec
 
 from recorder import AWAY_NS, GapRepair, InboundMessage, InboundQueue, SiteReception
 from trilat_net.analysis import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
-from trilat_net.core import TAKEN, LifeAlarm, find_alarm
+from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import (
     Bus,
@@ -185,7 +185,7 @@ class SiteView:
             lost_peers = self.layout.list_lost_peers(record.mem, self.peers)
         shared_coordinates = len(record.q_des)  # by which `mem` is divided
         # The function of the module `ticks`, which derives an alarm from a record alone.
-        alarm = find_alarm(
+        alarm = LifeAlarm.find(
             session=session,
             site=name,
             mode=record.mode,

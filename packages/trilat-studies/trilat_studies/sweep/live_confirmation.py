@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis import EndBehaviour, classify_log_end
+from trilat_net.analysis import EndBehaviour, RunEnd
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log import open_log
 from trilat_net.presentation import TextTable
@@ -179,7 +179,7 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> _ConfirmedCell:
 
     live = None
     try:
-        end = classify_log_end(open_log(path))
+        end = RunEnd.of_log(open_log(path))
     except LogError as error:
         text = "; ".join([*problems, str(error)])
     else:
