@@ -22,11 +22,15 @@ BELOW_ALL = {
 
 
 INTERFACES = (
+    "trilat_net.log.ros2",
     *("trilat_net.core", "trilat_net.laws", "trilat_net.own_code", "trilat_net.scenario"),
     *("trilat_net.net", "trilat_net.log", "trilat_net.execution", "trilat_net.analysis"),
     *("trilat_net.presentation", "trilat_net.work", "trilat_net.app", "sites", "recorder"),
 )
-"""The packages whose `__init__.py` lists in `__all__` what other packages may import."""
+"""The packages whose `__init__.py` lists in `__all__` what other packages may import.
+
+A package within another one stands before it.
+"""
 _APP_ROOTS = ("trilat_net", "trilat_net.__main__", "trilat_net.extension")
 """Modules beside the packages that belong to the app."""
 

@@ -95,6 +95,7 @@ def find_homes(package: str) -> dict[str, str]:
             ".".join(path.relative_to(folder).with_suffix("").parts).removesuffix(".__init__")
             for path in folder.rglob("*.py")
             if path.parent != folder or path.name != "__init__.py"
+            if house.find_package(house.dotted(path)) == package
             if path.stem == name or name in house.assigned_names(path)
         }
         if known.get(name) in modules:
@@ -150,7 +151,8 @@ def write_tables(package: str, homes: Mapping[str, str]) -> None:
 
 
 def _hooks_of(package: str) -> str:
-    return "..hooks" if package.startswith("trilat_net.") else "trilat_net.hooks"
+    depth = package.count(".")
+    return "." * (depth + 1) + "hooks" if depth else "trilat_net.hooks"
 
 
 def main() -> None:

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from ..analysis import recorded_end_s
 from ..core import Array
 from ..errors import UnknownName, UsageError, suggest_nearest
-from ..log import NUMBERS_BY_MODE_WORD, UNIT_SUFFIXES, Column, Ints, Log
+from ..log import UNIT_SUFFIXES, Column, Ints, Log
+from ..log.ros2 import NUMBERS_BY_MODE_WORD
 from ..scenario import TASK_AXES
 from . import style
 from .appearance import REPORT_SIZE

@@ -23,7 +23,7 @@ that they do not know.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..log import (
+from ..log.ros2 import (
     FLOAT64_ARRAY,
     NUMBERS_BY_MODE_WORD,
     POSE,

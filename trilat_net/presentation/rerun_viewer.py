@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 
 from ..errors import RunFailed, UsageError
 from ..files import import_extra
-from ..log import (
-    ACTIVE_SUFFIX,
+from ..log import ACTIVE_SUFFIX, Log
+from ..log.ros2 import (
     DIAGNOSTICS,
     EVENTS,
     FRAMES,
@@ -39,7 +39,6 @@ from ..log import (
     STRING,
     TRANSFORMS,
     WORLD,
-    Log,
     Ros2Channel,
     read_ros2_channels,
 )

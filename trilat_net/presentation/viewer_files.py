@@ -14,15 +14,14 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-from ..log import (
+from ..log import VIZ_ROOT, open_log
+from ..log.ros2 import (
     NAMINGS,
-    VIZ_ROOT,
     Ros2Channel,
     TopicTable,
     build_rviz_config,
     list_full_topics,
     make_session_name,
-    open_log,
     read_ros2_channels,
 )
 from .foxglove_layout import build_foxglove_layout

@@ -30,7 +30,7 @@ from pathlib import Path
 from trilat_net.app import RunningSession, open_hand
 from trilat_net.errors import TrilatError, UsageError, count_nouns
 from trilat_net.files import refuse_existing, write_whole
-from trilat_net.log import (
+from trilat_net.log.ros2 import (
     COMMON_TOPICS,
     DIAGNOSTICS,
     FRAMES_TOPIC,

@@ -48,7 +48,7 @@ def ros2_command(
         rviz: Write a configuration of RViz that shows the arms of the session.
     """
     from trilat_net.app import RunningSession
-    from trilat_net.log import TopicTable
+    from trilat_net.log.ros2 import TopicTable
     from trilat_net.net import BRIDGE, DISTROS, Refusals, Ros2Graph, check_hosts, check_ros_name
 
     from .ros2_bridge import serve_ros2

@@ -14,7 +14,7 @@ Invariant:
 from typing import NamedTuple
 
 from trilat_net.app import ShareHistory
-from trilat_net.log import SiteMessages, TopicTable
+from trilat_net.log.ros2 import SiteMessages, TopicTable
 from trilat_net.net import (
     Bus,
     Clock,

@@ -16,9 +16,9 @@ Invariant:
 from collections.abc import Callable, Iterable, Sequence
 
 from ...core import POSE, POSITION
+from ...log import QuaternionSigns
 from ...net import LinkStats, State
 from ...scenario import Scenario
-from ..orientations import QuaternionSigns
 from . import cdr
 from .robot_model import WORLD, FramePose, RobotModel, Vector, compute_quaternion
 from .ros2_messages import (

@@ -24,11 +24,10 @@ from mcap.reader import make_reader
 
 from ...core import POSITION
 from ...files import reading
+from ...log import McapWriter, compute_task_errors
 from ...net import MODE_WORDS, Event, LinkStats, State
 from ...records import Mode, TickRecord
 from ...scenario import TASK_AXES, Scenario, describe_event
-from ..mcap_writer import McapWriter
-from ..site_log import compute_task_errors
 from . import cdr
 from .robot_model import RobotModel
 

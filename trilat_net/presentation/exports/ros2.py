@@ -20,17 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from ...analysis import trace_dominance
-from ...log import (
+from ...log import SCENARIO, Log, McapWriter, collect_provenance
+from ...log.ros2 import (
     DIAGNOSTICS,
     FRAMES_TOPIC,
     NAMINGS,
-    SCENARIO,
-    Log,
-    McapWriter,
     SiteMessages,
     TopicTable,
     cdr,
-    collect_provenance,
     list_full_topics,
     make_session_name,
     pack_session_diagnostics,
