@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from trilat_net.core import LifeReason, PlantState, Site
+from trilat_net.core import RELEASE_REASONS, LifeReason, PlantState, Site
 from trilat_net.errors import SessionError, WireError
 from trilat_net.files import find_page
 from trilat_net.net import ArmEnable, ArmMeasurement, Clock, StampedInbox, decode
@@ -389,7 +389,7 @@ class DeadManSwitch:
         """Returns what the site must do because of the state of the dead-man switch.
 
         While the switch is released, every call returns the order to stop, until the arm has
-        stopped or its site reports a fault.
+        stopped for this reason or its site reports a fault.
 
         Args:
             mode: Present mode of the site, for example stopped.
@@ -402,8 +402,8 @@ class DeadManSwitch:
         was_released = self._was_released
         self._was_released = False
         if was_released or not self.held:
-            is_at_rest = mode in (Mode.STOPPED, Mode.FAULT)
-            return "" if is_at_rest else "released"
+            is_known = mode == Mode.STOPPED and reason in RELEASE_REASONS
+            return "" if is_known or mode == Mode.FAULT else "released"
         is_stopped_by_switch = mode == Mode.STOPPED and reason == LifeReason.RELEASED
         return "held" if is_stopped_by_switch else ""
 

@@ -100,7 +100,7 @@ ELSEWHERE = {
     "docs/sessions/live-page.md: trilat live": "packages/trilat-people/tests/live_tests/test_live_page.py",
     "docs/studies/measured-hands.md: trilat identify hand": "tests/cli/test_linears.py",
     "docs/logs/replay.md: trilat replay": "tests/live/test_replay.py",
-    "docs/maps/README.md: trilat sweep runs/mine --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
+    "docs/maps/README.md: $ trilat sweep runs/mine": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator --host": "tests/live/test_namespaces.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator router": "tests/live/test_routers.py",
@@ -130,6 +130,7 @@ NOT_RUN = {
     "docs/sessions/ros2.md: export RMW": "needs an installation of ROS 2",
     "docs/sessions/two-operators.md: ZENOH_CONFIG_OVERRIDE": "needs an installation of ROS 2",
     "docs/sessions/ros2.md: ros2": "needs an installation of ROS 2",
+    "docs/sessions/ros2.md: import rclpy": "needs an installation of ROS 2",
     "docs/studies/train-policies.md: from stable_baselines3": "needs Stable-Baselines3; done by hand",
     "docs/sessions/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
 }

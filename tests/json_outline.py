@@ -11,7 +11,7 @@ _NAMED = re.compile(
     r"\.(sites|links|walls|judged|records|parameters|channels|remarks|means|unknown|edges|q_rad|x|theta_hat"
     r"|delay_in_use_ms|passive_qd_of_joint|versions|accounts|compression|attachments"
     r"|beta_first|beta_last|parts_last_j|taken_j|given_j|causes_j|sites_unexplained_max_j|part|ended|torque_nm|weight"
-    r"|metadata|absent|orders|coverage|counts|laws|gains|gains\[\]\.gains|outcomes|tau_limit_nm)$"
+    r"|metadata|absent|orders|coverage|counts|laws|gains|gains\[\]\.gains|outcomes|tau_limit_nm|study\.conditions|exclusions)$"
 )
 """Tables whose keys are names."""
 

@@ -110,6 +110,7 @@ SCENARIO_OF = {
     "docs/studies/measured-hands.md": "two_sites",
     "docs/reference/silent-peers.md": "paper",
     "docs/sessions/live-hands.md": "play",
+    "docs/reference/operators.md": "paper",
     "docs/logs/felt-forces.md": "free",
     "docs/extend/own-controller.md": "paper",
     "docs/extend/own-plant.md": "paper",
@@ -215,7 +216,9 @@ COMMAND_PAGES = {
     "docs/tutorials/first-result.md",
     "docs/tutorials/lab.md",
     "docs/reference/laws.md",
+    "docs/reference/links.md",
     "docs/studies/linear.md",
+    "docs/overview.md",
     "docs/reference/metrics.md",
     "docs/reference/silent-peers.md",
     "docs/reference/stability.md",
@@ -380,12 +383,23 @@ def check_rerun(_: str, names: dict[str, Any]) -> None:
     assert f"(before={error.before:.4f}, after={error.after:.4f})" in page
 
 
+def check_groups(output: str, _: dict[str, Any]) -> None:
+    """Every group of the lab has gains of its own, and abs(lambda_min) K T as its margins."""
+    rows = [[float(word) for word in line.split()] for line in output.splitlines()[1:]]
+    assert len({tuple(row[1:4]) for row in rows}) == len(rows) == 15
+    for _, stiffness, delay_ms, share, *_, three, two, unequal in rows:
+        at_one = stiffness * delay_ms / 1000.0
+        wanted = (0.5 * at_one, at_one, share * at_one)
+        assert (three, two, unequal) == pytest.approx(wanted, abs=1e-3)
+
+
 CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
     "docs/studies/linear.md": check_linear,
     "docs/theory/port-results.md": check_ports,
     "docs/theory/linear-examples.md": check_linear_examples,
     "docs/reference/observed-energy.md": check_energies,
     "docs/logs/rerun.md": check_rerun,
+    "docs/tutorials/lab-answers.md": check_groups,
 }
 """By page what it says of the results of its code."""
 

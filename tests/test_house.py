@@ -50,7 +50,7 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 315,
+    "kernel": 316,
     "session": 277,
     "analysis": 109,
     "app": 60,

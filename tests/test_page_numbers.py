@@ -465,8 +465,8 @@ PAGES: dict[str, dict[str, Make]] = {
             energy.booked("paper", "digital").residual,
             *[energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
-        "{} runs of the twenty-three": lambda: [len(shipped_trials())],
-        "run once): {} s simulated": lambda: [
+        "makes {} runs of the shipped": lambda: [len(shipped_trials())],
+        "random once): {} s simulated": lambda: [
             sum(one.scenario.duration_s for one in shipped_trials())
         ],
     },

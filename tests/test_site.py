@@ -53,6 +53,24 @@ def test_the_first_pages_links_exist() -> None:
     assert [missing for missing in places if not missing.is_file()] == []
 
 
+def test_links_of_gathered_pages_lead_to_files(tmp_path: Path) -> None:
+    """Also links to files that stand beside docs in the repository, such as examples."""
+    folder = tmp_path / "docs"
+    MAKE.gather_pages(folder)
+    assert (folder / "examples/package/trilat_lag.py.md").is_file()
+    made_later = {f"{name}.md" for name in ("commands", "python", "scenario", "scenarios")}
+    absent = []
+    for page in folder.rglob("*.md"):
+        text = re.sub(
+            r"```.*?```|~~~~.*?~~~~", "", page.read_text(encoding="utf-8"), flags=re.DOTALL
+        )
+        for address in re.findall(r"\]\((?!\w+:)([^)#\s]+)", text):
+            target = page.parent / unquote(address)
+            if not target.exists() and target.name not in made_later:
+                absent.append((page.name, address))
+    assert absent == []
+
+
 def test_the_menu_has_nine_entries_at_most() -> None:
     settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
     entries = settings["project"]["nav"]

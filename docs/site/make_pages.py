@@ -42,16 +42,7 @@ SPACES = {
 def main() -> None:
     """Gathers all pages, and the settings of Zensical beside them."""
     shutil.rmtree(SITE, ignore_errors=True)
-    shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site", "media"))
-    for name in BESIDE:
-        write(name if name.endswith(".md") else f"{name}.md", read_beside_docs(name))
-    write("index.md", read_beside_docs("README.md"))
-    for page in PAGES.rglob("*.md"):
-        lift_links_beside_docs(page)
-        link_to_rendered_tables(page)
-        typeset_formulas(page)
-    for table in sorted((PAGES / "data").glob("*.csv")):
-        write(f"data/{table.stem}.md", render_table(table))
+    gather_pages(PAGES)
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
@@ -63,9 +54,25 @@ def main() -> None:
     shutil.copy(HERE / "formulas.css", PAGES / "assets")
 
 
-def write(name: str, text: str) -> None:
+def gather_pages(folder: Path) -> None:
+    """Gathers the pages of docs, those beside docs, and the files that they link to, in a folder."""
+    shutil.copytree(ROOT / "docs", folder, ignore=shutil.ignore_patterns("site", "media"))
+    for name in BESIDE:
+        write(name if name.endswith(".md") else f"{name}.md", read_beside_docs(name), folder)
+    write("index.md", read_beside_docs("README.md"), folder)
+    for page in sorted(folder.rglob("*.md")):
+        lift_links_beside_docs(page, folder)
+        link_to_rendered_tables(page)
+        for example in link_to_examples(page):
+            write(f"{example}.md", render_example(example), folder)
+        typeset_formulas(page)
+    for table in sorted((folder / "data").glob("*.csv")):
+        write(f"data/{table.stem}.md", render_table(table), folder)
+
+
+def write(name: str, text: str, folder: Path = PAGES) -> None:
     """Writes a page."""
-    path = PAGES / name
+    path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text.rstrip() + "\n", encoding="utf-8")
 
@@ -76,9 +83,9 @@ def read_beside_docs(name: str) -> str:
     return re.sub(r'(\]\(|src=")docs/', r"\1", page)
 
 
-def lift_links_beside_docs(page: Path) -> None:
+def lift_links_beside_docs(page: Path, folder: Path) -> None:
     """Rewrites a page's links to what stands beside docs in the repository: here it stands in docs."""
-    outside = "](" + "../" * len(page.relative_to(PAGES).parts)
+    outside = "](" + "../" * len(page.relative_to(folder).parts)
     inside = outside.removesuffix("../")
     text = page.read_text(encoding="utf-8").replace(f"{outside}README.md", f"{inside}index.md")
     page.write_text(text.replace(outside, inside), encoding="utf-8")
@@ -89,6 +96,27 @@ def link_to_rendered_tables(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     page.write_text(
         re.sub(r"\]\(((?:\.\./)*data/[\w-]+)\.csv\)", r"](\1.md)", text), encoding="utf-8"
+    )
+
+
+def link_to_examples(page: Path) -> list[str]:
+    """Makes the links of a page to files of examples lead to pages that show them.
+
+    Returns the paths of these files in the repository.
+    """
+    text = page.read_text(encoding="utf-8")
+    pattern = r"(\]\((?:\.\./)*)(examples/[\w/-]+\.\w+)\)"
+    page.write_text(re.sub(pattern, r"\1\2.md)", text), encoding="utf-8")
+    return [path for _, path in re.findall(pattern, text)]
+
+
+def render_example(path: str) -> str:
+    """Returns a file of examples as a page."""
+    code = (ROOT / path).read_text(encoding="utf-8")
+    name = Path(path).name
+    language = {".py": "python", ".toml": "toml"}.get(Path(path).suffix, "text")
+    return (
+        f"# {name}\n\nThe repository has this file as `{path}`.\n\n~~~~{language}\n{code}~~~~"
     )
 
 
@@ -146,7 +174,9 @@ def render_table(path: Path) -> str:
         download += f" Here are the first {MOST_ROWS}."
     lines = [heads, ["---"] * len(heads), *rows[:MOST_ROWS]]
     table = "\n".join(f"| {' | '.join(map(escape_cell, line))} |" for line in lines)
-    return f"# {title[:1].upper()}{title[1:]}\n\n{download}\n\n{table}"
+    # Rows of data would stand before the pages that explain them among the results of a search.
+    hidden = "---\nsearch:\n  exclude: true\n---\n"
+    return f"{hidden}\n# {title[:1].upper()}{title[1:]}\n\n{download}\n\n{table}"
 
 
 def escape_cell(text: str) -> str:

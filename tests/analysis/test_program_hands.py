@@ -7,6 +7,7 @@ import pytest
 import trilat_net as tn
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.run_end import Stability
+from trilat_net.analysis.run_remarks import list_remarks
 from trilat_net.analysis.theory.loop_roots import find_log_roots, find_run_roots
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
@@ -41,6 +42,16 @@ def test_judgement_names_the_omitted_program_reaction() -> None:
     assert "exact roots" not in certificate.decision.rests_on
     remark = next(text for text in certificate.remarks if text.startswith("a program moves m2"))
     assert "leave out how the arms and the program act on each other" in remark
+
+
+def test_a_remark_counts_the_programs() -> None:
+    hands = {
+        f"sites.{site}.hands": [{"kind": "own", "class": "tests.own_code:Follower"}]
+        for site in ("m1", "m2")
+    }
+    (remark,) = list_remarks(tn.simulate("free", hands, duration_s=1.0))
+    assert remark.startswith("programs move m1 and m2;")
+    assert "how the arms and these programs act on each other" in remark
 
 
 def test_failed_program_is_warned_of_and_reported() -> None:

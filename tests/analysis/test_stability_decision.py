@@ -20,7 +20,7 @@ PUSHES = Push.choose(load_scenario("two_sites"))
 STABLE_ROOTS = LoopRoots("stable", -0.163, True, "this rest: stable, -0.163 /s")
 UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True, "this rest: unstable, +0.0424 /s")
 NO_ROOTS = LoopRoots("", None, False, "this rest: no roots: its code may not run")
-THEOREM = "the theorem, all of whose premises hold"
+THEOREM = "the theorem (continuous time; every premise checked here holds)"
 
 
 def end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> RunEnd:

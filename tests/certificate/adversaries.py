@@ -27,7 +27,7 @@ import numpy as np
 from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net
-from trilat_net.analysis.certificate.premises import explain_no_functional
+from trilat_net.analysis.certificate.premises import find_missing_functionals
 from trilat_net.analysis.judge import judge_virtual_run
 from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
 from trilat_net.analysis.theory.linear_edge import find_contact_growth, find_rightmost_root
@@ -761,7 +761,7 @@ def say_of_run(scenario: Scenario) -> str:
 
     V, if the law has one, takes all records.
     """
-    if not explain_no_functional(scenario):
+    if not find_missing_functionals(scenario):
         return say_of(trilat_net.simulate(scenario))
     run = FusedRun(scenario)
     run.advance_to(scenario.duration_s)

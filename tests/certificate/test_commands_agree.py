@@ -25,7 +25,7 @@ DRAWN_S = 10.0
 """Duration of a drawn run. A shorter run has other words, but the same ones by every command."""
 SHIPPED_S = 8.0
 """Largest duration of the run of a shipped scenario."""
-THEOREM = "the theorem, all of whose premises hold"
+THEOREM = "the theorem (continuous time; every premise checked here holds)"
 """A basis that needs all records of a run. A sweep and a bench keep them only where nothing else decides."""
 SAME_RATE = 1e-6
 """Largest difference of the rates of one root, relative and in 1/s: 2 or 6 roots are computed."""

@@ -17,7 +17,7 @@ from trilat_net.analysis.certificate.observed_energy import (
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.run_end import Stability
 from trilat_net.execution.twins import Push, Twins
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
 
 from ..unit_arm import unit_scenario
@@ -108,6 +108,40 @@ def test_passive_laws_prove_bounded_motion_and_no_decay(law: str) -> None:
         assert list_law_proofs(scenario) == []
 
 
+def write_slow_pair(d: float) -> Scenario:
+    """Returns a session of P+d at 30 Hz, whose condition of continuous time holds."""
+    return load_scenario(
+        "two_sites",
+        {
+            "control.law": "p_d",
+            "control.K": 50.0,
+            "control.d": d,
+            "rate_hz": 30,
+            "link.delay_ms": 0.0,
+            "duration_s": 0.5,
+        },
+    )
+
+
+SAMPLING = "but sampling breaks it here: the roots of the sampled loop grow"
+
+
+@pytest.mark.parametrize(("d", "grows"), [(5.0, False), (5.6, True)])
+def test_conditions_say_where_sampling_breaks_them(d: float, grows: bool) -> None:
+    """A condition of continuous time holds at any rate, and beside growing roots says so."""
+    scenario = write_slow_pair(d)
+    (alone,) = describe_law_conditions(scenario)
+    assert " holds: " in alone
+    assert "sufficient in continuous time" in alone
+    analysis = tn.linear(scenario, ports=False)
+    assert (analysis.sampled.verdict == "unstable") is grows
+    (beside,) = [note for note in analysis.notes if note.startswith(alone)]
+    assert (SAMPLING in beside) is grows
+    certificate = tn.certify(tn.simulate(scenario), twins=0)
+    assert certificate.roots.is_refutation is grows
+    assert certificate.law_conditions == (beside,)
+
+
 SLIDING = [
     SampledLoop(PAIR, constant(80.0), 0.0, 0.0, (2.9,), 100),
     SampledLoop(THREE, constant(200.0), 0.0, 0.0, (2.2,), 100),
@@ -130,7 +164,10 @@ def test_theorem_covers_prismatic_joints(loop: SampledLoop) -> None:
     """M, C and G of sliding joints are constant, so that every step of the proof holds."""
     certificate = tn.certify(tn.simulate(write_sliding(loop, 20.0)))
     assert certificate.stability is Stability.STABLE
-    assert "the theorem, all of whose premises hold" in certificate.decision.rests_on
+    assert (
+        "the theorem (continuous time; every premise checked here holds)"
+        in certificate.decision.rests_on
+    )
 
 
 def test_theorem_excludes_prismatic_joints_over_varying_delay() -> None:

@@ -13,6 +13,7 @@ import pytest
 from rich.table import Table
 
 from tests.chains import six_joints
+from tests.log_editing import edited, recorded
 from tests.task_arms import planar_task
 from trilat_net.presentation.terminal_output import TextConsole, print_json, print_line
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
@@ -168,6 +169,18 @@ def write_arms(kind: str, folder: Path) -> list[str]:
             for word in ("--set", f"{key}={json.dumps(value)}")
         ),
     ]
+
+
+@pytest.mark.parametrize(
+    "command", ["certify", "certify --accept open", "certify --json", "metrics", "report"]
+)
+def test_a_log_without_records_is_refused(command: str, tmp_path: Path) -> None:
+    """Nothing is judged, measured or written if no site has a record."""
+    (tmp_path / "run.mcap").write_bytes(edited(recorded("paper"), record=lambda _: None))
+    trilat(*command.split(), "run.mcap", cwd=tmp_path).refuses(
+        "run.mcap: no site has a record in this log, so that there is nothing to judge"
+    )
+    assert list(tmp_path.iterdir()) == [tmp_path / "run.mcap"]
 
 
 @pytest.mark.parametrize("kind", ARMS)

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from trilat_net.presentation.figures.compared_runs import COMPARED_SIGNALS
+
 from .running import trilat
 
 
@@ -51,6 +53,19 @@ def test_the_list_names_impossible_figures(folder: Path) -> None:
     assert absent["positions"] is None
     assert absent["contact"] == "no site has a wall in this run"
     assert not (folder / "run-figures").exists()
+
+
+def test_figures_of_two_logs_are_written(folder: Path) -> None:
+    """Without names, `--with` writes the overlay and the figures with a panel per site."""
+    again = ("rerun", "run.mcap", "--closed-loop", "--set", "link.delay_ms=300", "-o", "b.mcap")
+    trilat(*again, cwd=folder).succeeds()
+    together = ("figure", "run.mcap", "--with", "b.mcap", "--format", "svg", "--out")
+    names = ["overlay", *(f"overlay_{name}" for name in COMPARED_SIGNALS)]
+    written = trilat(*together, "both", cwd=folder).succeeds().split()
+    assert written == [f"both/{name}.svg" for name in names]
+    one = trilat(*together, "one", "positions", cwd=folder).succeeds().split()
+    assert one == ["one/overlay_positions.svg"]
+    trilat(*together, "no", "phase", cwd=folder).refuses("'phase'", "tracking_errors")
 
 
 @pytest.mark.parametrize(

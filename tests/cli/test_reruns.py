@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import trilat_net
 from tests.log_editing import edited
 from trilat_net.log.log_reader import open_log
 
@@ -51,6 +52,21 @@ def test_closed_loops_have_a_row_per_site(log_file: Path) -> None:
         == 3
     )
     assert "link m1->s: samples in use were 200 ms old" in text
+
+
+def test_reruns_show_what_a_delay_costs(log_file: Path) -> None:
+    """The column `undelayed` has the metric of the log and that of the written rerun."""
+    options = ("--closed-loop", "--set", "link.delay_ms=300", "-o", "again.mcap")
+    text = trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds()
+    header, row = [line for line in text.splitlines() if line.startswith(("site ", "s   "))]
+    assert "undelayed: largest distance in rad from where the peers are" in text
+    # "rms e rad", "max e rad" and "max tau N m" are names of more than one word
+    column = header.replace(" e rad", "").replace(" tau N m", "").split().index("undelayed")
+    for log, cell in zip(
+        (log_file, log_file.parent / "again.mcap"), row.split()[column:], strict=False
+    ):
+        undelayed_rad = trilat_net.metrics(log).sites["s"]["undelayed_max_rad"].value
+        assert cell == f"{undelayed_rad:#.3g}"
 
 
 def test_every_command_reads_the_resulting_log(log_file: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import trilat_net as tn
+from trilat_net.app.cli.options import RunOptions
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import list_shipped, load_scenario
 
@@ -39,6 +40,27 @@ def test_shown_text_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     assert load_scenario(copy).sha256 == load_scenario(name).sha256
     output = trilat("scenario", "check", copy, cwd=tmp_path).succeeds()
     assert f"sha256 {load_scenario(name).sha256[:16]}" in output
+
+
+@pytest.mark.parametrize(
+    ("setting", "option"), [("duration_s=5", ("--duration", "3")), ("seed=2", ("--seed", "9"))]
+)
+@pytest.mark.parametrize("command", [("scenario", "show"), ("sim",), ("demo",), ("live",)])
+def test_keys_are_not_set_twice(
+    command: tuple[str, ...], setting: str, option: tuple[str, str], tmp_path: Path
+) -> None:
+    """An option that would override --set is refused, and names the key."""
+    arguments = (*command, "two_sites", "--set", setting, *option)
+    trilat(*arguments, cwd=tmp_path).refuses(f"--set {setting}", " ".join(option), "same key")
+
+
+def test_set_durations_win_over_the_default() -> None:
+    """A page runs an hour, unless --set or --duration says otherwise."""
+    assert RunOptions().load("two_sites", 3600.0).duration_s == 3600.0
+    assert RunOptions().load("two_sites").duration_s == load_scenario("two_sites").duration_s
+    assert RunOptions(duration=4.0).load("two_sites", 3600.0).duration_s == 4.0
+    changed = RunOptions(overrides=["duration_s=5", "control.Kd=4"])
+    assert changed.load("two_sites", 3600.0).duration_s == 5.0
 
 
 def test_show_prints_overrides_resolved(tmp_path: Path) -> None:

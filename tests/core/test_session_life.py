@@ -2,6 +2,8 @@
 its way back.
 """
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,15 @@ import trilat_net
 from tests.core.guarded_runs import TEXT
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.core.life.session_life import MIN_ALIGN_NS
-from trilat_net.core.step.ticks import LifeReason
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import (
+    RELEASE_REASONS,
+    CoreChange,
+    LifeOrder,
+    LifeReason,
+    Mode,
+    TickInput,
+)
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
@@ -121,3 +131,28 @@ def test_a_silence_shorter_than_two_periods_is_refused(
         parse_scenario(
             text.format(duration_s=1.0, rate_hz=rate_hz, outages_s="[]", speed=0.5, limit=1.0)
         )
+
+
+ORDERS = (LifeOrder.STOP, LifeOrder.RELEASED, LifeOrder.HELD, LifeOrder.ENABLE)
+"""Orders that concern a stopped arm."""
+
+
+@pytest.mark.parametrize("orders", list(product(ORDERS, repeat=3)))
+def test_released_arms_stay_braked_until_allowed(orders: tuple[LifeOrder, ...]) -> None:
+    """After a release no further stop opens the brakes, and only `enable` ends a stop."""
+    site = Site(glide().setup("s"))
+    is_stopped = False
+    is_released = False
+    for tick, order in enumerate(orders):
+        change = CoreChange(order.name.lower(), order=order)
+        site.step(TickInput(tick, commands=[change]))
+        if order is LifeOrder.STOP:
+            is_stopped = True
+        elif order is LifeOrder.RELEASED:
+            is_released = True
+        elif order is LifeOrder.ENABLE or not is_stopped:
+            is_stopped = False
+            is_released = False
+        is_braked = site.life_reason in RELEASE_REASONS
+        assert (site.mode is Mode.STOPPED) == (is_stopped or is_released)
+        assert is_braked == is_released

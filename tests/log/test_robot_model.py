@@ -18,7 +18,7 @@ from trilat_net.log.ros2.robot_model import (
     rotate_vector,
 )
 from trilat_net.log.ros2.ros2_messages import ROBOT_CHANNELS, Ros2SiteChannels
-from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 
 POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5, 0.1, 1.6, 0.2]}
 
@@ -99,8 +99,6 @@ def test_the_robot_description_has_the_links_and_shapes():
 
 def test_unlike_arms_end_where_sites_say():
     """A planar arm among chains has a model too, and bases stand where the scenario places them."""
-    from trilat_net.scenario import load_scenario
-
     unlike = load_scenario("unlike_arms")
     for n, (site, spec) in enumerate(unlike.sites.items()):
         model = RobotModel(unlike, site)
@@ -115,7 +113,15 @@ def test_unlike_arms_end_where_sites_say():
     assert model.frames[-1][1] == "s/" + reference_tip("arm7")
 
 
-def test_planar_arms_alone_have_no_model():
-    from trilat_net.scenario import load_scenario
+@pytest.mark.parametrize("name", ["play", "six_joints", "unlike_arms"])
+def test_joint_states_name_the_joints_of_urdfs(name):
+    """The moving joints of the URDF for viewers have the names in joint states, in their order."""
+    whole = load_scenario(name)
+    for site in whole.names:
+        joints = ElementTree.fromstring(RobotModel(whole, site).description).iter("joint")
+        moving = [joint.get("name") for joint in joints if joint.get("type") != "fixed"]
+        assert moving == Ros2SiteChannels(whole, site).joints
 
+
+def test_planar_arms_alone_have_no_model():
     assert Ros2SiteChannels(load_scenario("two_sites"), "m").robot is None

@@ -68,4 +68,5 @@ def test_short_certificates_begin_like_long_ones() -> None:
     *blocks, last = compose(certificate, brief=True)
     lines = [line.print_form.lines() for line in describe_certificate(certificate)]
     assert [block.lines() for block in blocks] == lines
-    assert last.lines() == ["--all prints 9 premises and the energies too"]
+    pointer = "premises are what the theorem requires (docs/reference/certificate-premises.md)"
+    assert last.lines() == [f"--all prints 9 premises and the energies too; {pointer}"]

@@ -9,17 +9,23 @@ import pytest
 
 from tests.analysis import logs
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
+from trilat_net.analysis.twins.twin_growth import PushGrowth, TwinGrowth
+from trilat_net.execution.twins import Push
 from trilat_net.presentation.certificate_text import (
     describe_certificate,
+    describe_in_words,
     describe_judgement,
     describe_pace,
     list_energies,
 )
 from trilat_net.presentation.figures.certificate_energy import draw_functional
+from trilat_net.presentation.page_summary import describe_basis
+from trilat_net.scenario import load_scenario
 
 LOGS = {
     "free": lambda: runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log,
@@ -113,6 +119,75 @@ def test_the_first_line_agrees_with_its_judgement(
     # A judgement against stability rests on a line that is marked so.
     if judged.stability is Stability.NOT_STABLE and behaviour is not EndBehaviour.DIVERGED:
         assert "FAIL" in [line.mark for line in lines[1:]]
+
+
+PUSH = PushGrowth(
+    push=Push.choose(load_scenario("two_sites"))[0],
+    trend=EnvelopeTrend.DECAYS,
+    rate_per_s=-0.5,
+    factor=0.01,
+    joint="m1 joint 1",
+    group=0,
+    becomes_rad_s=1e-7,
+)
+EVIDENCE = {
+    "proof": ("stable", (PUSH,)),
+    "pushes": ("", (PUSH,)),
+    "growing push": (
+        "",
+        (PUSH._replace(trend=EnvelopeTrend.GROWS, rate_per_s=0.5, factor=9.0),),
+    ),
+    "growing root": ("unstable", ()),
+    "nothing": ("", ()),
+}
+"""Verdict of exact roots, and pushes, by what they show."""
+
+
+def judge_end(behaviour: EndBehaviour, evidence: str, speed_rad_s: float) -> Certificate:
+    """Returns the certificate of a run with the given end and evidence, and without doubts."""
+    certificate = certify(LOGS["p_d"]())
+    verdict, pushes = EVIDENCE[evidence]
+    end = certificate.end._replace(
+        behaviour=behaviour, reasons=(), operator_acts=False, end_speed_rad_s=speed_rad_s
+    )
+    roots = LoopRoots(verdict, None, bool(verdict), "this rest")
+    return replace(certificate, end=end, roots=roots, twins=TwinGrowth("", 10.0, 20.0, pushes))
+
+
+@pytest.mark.parametrize("behaviour", EndBehaviour)
+@pytest.mark.parametrize("evidence", EVIDENCE)
+@pytest.mark.parametrize("speed_rad_s", [1e-4, 1.0])
+def test_halves_of_a_headline_agree(
+    behaviour: EndBehaviour, evidence: str, speed_rad_s: float
+) -> None:
+    """A word that the end of the record alone would not get says what it rests on instead."""
+    certificate = judge_end(behaviour, evidence, speed_rad_s)
+    word = certificate.stability.value
+    headline = certificate.headline()
+    assert headline.startswith(word)
+    if behaviour.stability is certificate.stability or word == "open":
+        assert headline.startswith(f"{word}: ")
+    elif behaviour.stability is Stability.SETTLED and word == "stable":
+        assert headline.startswith("stable: ")
+    elif word == "settled":
+        assert "too slow to move by 0.01 rad" in headline
+    else:
+        assert headline.startswith(("stable by proof, although ", "not stable, although "))
+    if word in ("stable", "settled"):
+        assert not re.search("no trend|growing|undecided|oscillation|drifting", headline)
+
+
+@pytest.mark.parametrize("behaviour", [EndBehaviour.CONVERGED, EndBehaviour.DECAYS])
+def test_settled_runs_state_their_speed(behaviour: EndBehaviour) -> None:
+    """Nothing claims that arms came to rest which are only slow, or slow down."""
+    certificate = judge_end(behaviour, "pushes", 0.0043)
+    assert certificate.stability is Stability.SETTLED
+    text = " ".join(line.text for line in describe_in_words(certificate))
+    assert "no joint was faster than 0.0043 rad/s at the end" in text
+    assert "no joint was faster than 0.0043 rad/s" in describe_basis(certificate)
+    assert (
+        "came to rest" not in f"{certificate.headline()} {text} {describe_basis(certificate)}"
+    )
 
 
 def test_divergence_is_stated_once_with_its_joint() -> None:

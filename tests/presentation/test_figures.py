@@ -22,6 +22,7 @@ from trilat_net.presentation.appearance import SITE_COLOURS, list_site_colours
 from trilat_net.presentation.figures import (
     age_and_lateness,
     arm_poses,
+    compared_runs,
     joint_motion,
     registry,
     run_overview,
@@ -287,9 +288,53 @@ def test_overlaid_runs_share_sites_and_kind():
     assert np.nanmax(one.get_ydata()) == max(
         np.abs(paper[site].tau).max() for site in paper.sites
     )
-    assert [text.get_text() for text in overlay.legends[0].get_texts()] == ["one", "two"]
+    texts = [text.get_text() for text in overlay.legends[0].get_texts()]
+    assert [text.partition(":")[0] for text in texts] == ["one", "two"]
     with pytest.raises(UsageError, match="in the same unit"):
         run_overview.draw_overlay({"a": paper, "b": task})
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [("positions", "q"), ("tracking_errors", "e"), ("control_torques", "tau")],
+)
+def test_compared_runs_have_a_line_per_run(name: str, field: str) -> None:
+    """In each panel of a site and joint, every run has its own dashes and the site's colour."""
+    runs = {
+        "soft": trilat_net.simulate("paper", {"duration_s": 1.0, "rate_hz": 100}),
+        "stiff": trilat_net.simulate(
+            "paper", {"duration_s": 1.5, "rate_hz": 100, "control.Kd": 9, "link.delay_ms": 80}
+        ),
+    }
+    figure = compared_runs.draw_compared_runs(runs, name)
+    sites = runs["soft"].sites
+    assert len(figure.axes) == 2 * len(sites)
+    for panel, axes in enumerate(figure.axes):
+        site, joint = sites[panel // 2], panel % 2
+        assert len({line.get_linestyle() for line in axes.lines}) == len(runs)
+        assert {line.get_color() for line in axes.lines} == {
+            style.site_colour(runs["soft"], site)
+        }
+        for line, log in zip(axes.lines, runs.values(), strict=True):
+            values = getattr(log[site], field)[:, joint]
+            assert np.nanmax(line.get_ydata()) == values.max()
+            assert np.nanmin(line.get_ydata()) == values.min()
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[len(sites) :] == [
+        "soft: duration_s = 1, control.Kd = 3, every link 200 ms",
+        "stiff: duration_s = 1.5, control.Kd = 9, every link 80 ms",
+    ]
+
+
+def test_compared_runs_share_their_sites() -> None:
+    """Sites that one run lacks have no panels, and no common site or five runs are refused."""
+    two = trilat_net.simulate("two_sites", {"duration_s": 0.2, "rate_hz": 100})
+    paper = trilat_net.simulate("paper", {"duration_s": 0.2, "rate_hz": 100})
+    runs = {"paper": paper, "two": two}
+    assert compared_runs.list_common_sites(runs) == ["s"]
+    assert len(compared_runs.draw_compared_runs(runs, "positions").axes) == 2
+    with pytest.raises(UsageError, match="at most 4 runs"):
+        compared_runs.draw_compared_runs({str(n): two for n in range(5)}, "positions")
 
 
 def test_figures_show_themselves_in_a_notebook() -> None:

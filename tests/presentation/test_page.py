@@ -82,7 +82,8 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
     assert len(html) < 1_500_000
     body = html[html.index("</h1>") :]
     assert 0 < body.index('id="verdict"') < body.index("✗ Failed: ") < body.index('id="arms"')
-    assert "</b>the theorem does not apply (premises that fail: delays): V rose by" in html
+    failed = "premises that fail: delays must be constant"
+    assert f"</b>the theorem does not apply ({failed}): V rose by" in html
     assert "<td>V at 0 s</td>" in html
     assert 'src="data:image/png;base64,' in html
     sections = {attrs.get("data-section") for _, attrs in Page(html).elements} - {None}

@@ -1,14 +1,17 @@
 """The first lines of a report: a judgement that agrees with every number beside it."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.analysis import logs
 from tests.analysis.certificate import runs
+from tests.log_editing import edited, recorded
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
@@ -18,9 +21,9 @@ from trilat_net.analysis.run_view import RunView
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
-from trilat_net.log.log_reader import Log
+from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
-from trilat_net.presentation.conclusion import _tabulate_sites
+from trilat_net.presentation.conclusion import _tabulate_sites, conclude
 from trilat_net.presentation.page_summary import (
     describe_basis,
     find_error_peak,
@@ -55,20 +58,22 @@ def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> 
 
 
 def test_stable_run_names_its_proof() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 0.0)
+    certificate = judge(EndBehaviour.CONVERGED, 0.0012)
     assert certificate.stability is Stability.STABLE
+    speed_rad_s = certificate.end.end_speed_rad_s
     html = verdict_text(certificate)
     assert '<strong class="chip good">Stable</strong> A proof holds for this loop' in html
     assert "exact roots, slowest -0.5 /s." in html
     assert "small motions near the final pose" in html
-    assert "the arms were at rest and agreed" in html
+    assert f"was faster than {speed_rad_s:.2g} rad/s, and no error was above 0.0012 rad" in html
 
 
 def test_lasting_errors_are_explained() -> None:
     certificate = judge(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
     assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
     html = verdict_text(certificate)
-    assert "at rest, with errors that stay" in html
+    speed_rad_s = certificate.end.end_speed_rad_s
+    assert f"no joint was faster than {speed_rad_s:.2g} rad/s, and errors stay" in html
     assert "agreed" not in html
     assert "Stable means that disturbances die away, not that errors vanish" in html
 
@@ -204,6 +209,17 @@ def test_log_without_records_has_dashes() -> None:
     empty = logs.rewritten(logs.simulated("paper"), lambda _: False, finished=False)
     html = render_key_numbers(empty, summarise_run(empty))
     assert html.count("<dd>–</dd>") == 4
+
+
+def test_sessions_without_records_get_no_judgement(tmp_path: Path) -> None:
+    """A session that ended before any site published anything is neither stable nor open."""
+    path = tmp_path / "run.mcap"
+    path.write_bytes(edited(recorded("two_sites"), record=lambda _: None))
+    conclusion = conclude(open_log(path), tmp_path)
+    assert conclusion.verdict.text == "nothing to judge: no site has a record in this log"
+    assert conclusion.exit_code == 1
+    chips = re.findall('<strong class="chip bad">(.*?)</strong>', conclusion.page.read_text())
+    assert chips == ["Nothing to judge"]
 
 
 def test_end_errors_of_pushed_arms_are_marked() -> None:

@@ -38,7 +38,7 @@ def test_inapplicable_theorems_have_not_passed() -> None:
     ]
     assert line.mark == "note"
     assert line.text.startswith(
-        "the theorem does not apply (premises that fail: hands); V rose"
+        "the theorem does not apply (premises that fail: hands must add no energy); V rose"
     )
     assert describe_theorem(certificate) == [
         f"stability theorem of the paper (V: its energy function): {certificate.verdict.text}"

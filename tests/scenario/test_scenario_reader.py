@@ -302,6 +302,44 @@ def test_unknown_keys_name_the_nearest(key: str, nearest: str) -> None:
     assert f"did you mean '{nearest}'" in error.problem
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("link.delay_ms", -5.0),
+        ("link.delay_ms", "5 ms"),
+        ("control.Kd", -1.0),
+        ("control.Kd.1", -1.0),
+        ("control.Kd[1]", [1.0, -1.0]),
+        ("rate_hz", 0),
+        ("limits.qd_limit_rad_s", -1.0),
+        ("arm.g_m_s2", "x"),
+        ("sites.s.control.Kd[0]", -1.0),
+        ("links.m1->s.delay_ms", -5.0),
+    ],
+)
+def test_errors_name_the_key_as_written(key: str, value: object) -> None:
+    """Also a key of all sites or links, whether it changes a file or a resolved scenario."""
+    overrides = {key.partition("[")[0]: value}
+    for source in ("paper", load_scenario("paper")):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(source, overrides)
+        assert caught.value.path == key
+
+
+def test_errors_name_the_table_of_the_file() -> None:
+    """If a file sets a key for all links, the error has the path in the file."""
+    assert TEXT.count("delay_ms = 200.0") == 1
+    error = refused({}, TEXT.replace("delay_ms = 200.0", "delay_ms = -5.0"))
+    assert error.path == "link.delay_ms"
+
+
+@pytest.mark.parametrize("text", ["links.m1-", "links.m1-=5"])
+def test_names_cut_at_a_bracket_need_quotes(text: str) -> None:
+    """A shell takes > without quotes as the name of a file for the output."""
+    with pytest.raises(ScenarioError, match="in quotes"):
+        load_scenario("paper", [text])
+
+
 def test_odd_keys_are_refused_with_valid_ones() -> None:
     assert "valid keys are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
 

@@ -30,7 +30,7 @@ TEXT = planar_task()
         ({"task.axes": ["x", "rx"]}, "sites.m.task.axes", "rx, which belongs to a pose"),
         ({"task.axes": ["q"]}, "sites.m.task.axes[0]", "Invalid enum value 'q'"),
         ({"task.space": "place"}, "sites.m.task.space", "Invalid enum value 'place'"),
-        ({"task.scale": 0}, "sites.m.task.scale", "> 0"),
+        ({"task.scale": 0}, "task.scale", "> 0"),
         (
             {"task.posture_rad": [0, 0]},
             "sites.m.task.posture_rad",

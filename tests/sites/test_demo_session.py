@@ -5,17 +5,43 @@ import signal
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from numba.core import event
 
 from tests.cli.running import trilat
 from tests.live.processes import is_running
 from tests.net.waiting import until
+from trilat_net.app import demo_session
 from trilat_net.app.demo_session import ProcessStarter, SessionProcess
+from trilat_net.core.step.jit import COMPILING, compiling_notice
+from trilat_net.core.step.kernel import site_tick
+from trilat_net.scenario import load_scenario
 from trilat_net.scenario.scenario_reader import read_shipped
 from trilat_net.scenario.skeletons import name_skeleton_class
+from trilat_net.signals import Interrupt
 
 WAITS = ("record", "--session", "nobody", "--connect", "tcp/127.0.0.1:9", "-o", "run.mcap")
+
+
+def test_compilations_are_announced_before_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if loading the scenario has compiled, and announced, a part of the code before."""
+    said: list[str] = []
+    compiled = {"dispatcher": SimpleNamespace(py_func=site_tick.py_func)}
+
+    def compile_in_two_parts(_scenario: object, _site: str) -> None:
+        for _ in range(2):
+            event.start_event("numba:compile", compiled)
+            event.end_event("numba:compile", compiled)
+
+    monkeypatch.setattr(demo_session, "is_core_cached", lambda: False)
+    monkeypatch.setattr(demo_session, "warm_up", compile_in_two_parts)
+    monkeypatch.setattr(compiling_notice, "report", compiling_notice.report)
+    monkeypatch.setattr(compiling_notice, "is_reported", True)
+    with Interrupt() as interrupt:
+        demo_session.compile_core(load_scenario("two_sites"), said.append, interrupt)
+    assert said == [COMPILING]
 
 
 def started(folder: Path) -> ProcessStarter:

@@ -320,6 +320,8 @@ def test_switches_hold_until_released_or_silent() -> None:
     dead_man = Switch()
     switch, clock, ring, hear = dead_man.switch, dead_man.clock, dead_man.ring, dead_man.hear
     assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
+    assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == "released"
+    assert switch.pop_order(Mode.STOPPED, LifeReason.STOP_RELEASED) == ""
     assert switch.pop_order(Mode.FAULT, LifeReason.START) == ""
     assert not hear(1, 0, site="m")
     assert hear(1, 5)
@@ -631,6 +633,7 @@ def test_torque_counts_while_fresh_and_running() -> None:
     for tick, reason, torque in (
         (110, LifeReason.RELEASED, None),
         (120, LifeReason.STOP, (1.5, -2.5)),
+        (121, LifeReason.STOP_RELEASED, None),
     ):
         say(at(tick, mode="stopped", mem=[0.0, 0.0, 1e6, 0.0, 0.0, float(reason)]))
         assert port.torque() == torque

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trilat_net.analysis.certificate.stability_certificate import StabilityFinding, certify
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import LogCheckReport

@@ -19,7 +19,7 @@ from ..execution import FusedRun, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .certificate.observed_energy import find_energy_laws
-from .certificate.premises import explain_no_functional
+from .certificate.premises import find_missing_functionals
 from .certificate.stability_certificate import Certificate, certify
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability
@@ -89,12 +89,14 @@ def certify_run(
     if twins != 0:
         growth = TwinGrowth.of_log(log, certificate.end, twins, own_laws=own_laws)
     final_scenario = resolve_final_scenario(log)
+    roots = find_log_roots(log, own_laws=own_laws)
+    conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
     return replace(
         certificate,
-        roots=find_log_roots(log, own_laws=own_laws),
+        roots=roots,
         twins=growth,
         law_proofs=tuple(list_law_proofs(final_scenario)),
-        law_conditions=tuple(describe_law_conditions(final_scenario)),
+        law_conditions=tuple(conditions),
         has_lasting_delays=has_lasting_delays(final_scenario),
         remarks=list_remarks(log),
     )
@@ -172,5 +174,5 @@ def judge_virtual_run(
 
 def _has_energies(scenario: Scenario) -> bool:
     """Returns True if a run has the energy function V, or energies that its laws declare."""
-    has_functional = not explain_no_functional(scenario)
+    has_functional = not find_missing_functionals(scenario)
     return has_functional or bool(find_energy_laws(scenario, own_laws=True))

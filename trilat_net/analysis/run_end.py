@@ -40,7 +40,7 @@ from .torque_sources import compute_operator_script
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 SETTLED_SPEED_RAD_S = 1e-2
-"""Largest speed in the last second of a run whose arms have come to rest, in rad/s."""
+"""Largest speed in the last second at which the arms of a run count as resting, in rad/s."""
 
 STATIC_SPEED_RAD_S = 2e-3
 """Largest speed of an arm at which its torques count as balanced, in rad/s."""
@@ -87,8 +87,8 @@ MIN_SIGN_CHANGES = 6
 class Stability(StrEnum):
     """The four judgements of a run. The value of each member is the word for people.
 
-    STABLE needs a proof that the run does not contradict. SETTLED means that the motion came to
-    rest or decays, without a proof. OPEN means that the findings do not decide.
+    STABLE needs a proof that the run does not contradict. SETTLED means that the motion became
+    slow or decays, without a proof. OPEN means that the findings do not decide.
     """
 
     STABLE = "stable"
@@ -130,7 +130,7 @@ class EndBehaviour(StrEnum):
 
 
 LASTING_ERRORS = "at rest, with errors that stay"
-"""Phrase for arms that came to rest although their errors exceed the limit of settled sites."""
+"""Phrase for arms that are slow although their errors exceed the limit of settled sites."""
 _MAY_DRIFT = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
@@ -223,6 +223,8 @@ class RunEnd(NamedTuple):
         has_converged = self.behaviour is EndBehaviour.CONVERGED
         if has_converged and self.end_error_rad > SETTLED_ERROR_RAD:
             return LASTING_ERRORS
+        if self.missing_sites and self.behaviour is EndBehaviour.UNDECIDED:
+            return "undecided"  # a longer record of the other sites would not help
         return self.behaviour.value
 
     @property

@@ -54,10 +54,11 @@ def _describe_programs(log: Log) -> str:
     sites = list_program_sites(log)
     if not sites:
         return ""
-    subject = "a program moves" if len(sites) == 1 else "programs move"
+    moves = "a program moves" if len(sites) == 1 else "programs move"
+    actors = "the program" if len(sites) == 1 else "these programs"
     return (
-        f"{subject} {join_words(sites)}; recorded actions were repeated, so the roots and the "
-        "pushes leave out how the arms and the program act on each other"
+        f"{moves} {join_words(sites)}; recorded actions were repeated, so the roots and the "
+        f"pushes leave out how the arms and {actors} act on each other"
     )
 
 

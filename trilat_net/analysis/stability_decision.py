@@ -10,7 +10,8 @@ The decision combines what is known about a run:
 The words mean:
 
 - Stable: a proof exists for this loop, and the run does not contradict it.
-- Settled: the run came to rest and every push died away, but nothing proves more.
+- Settled: the run became slow or its motion was decaying (`run_end` has the limits), and every
+  push died away, but nothing proves more.
 - Not stable: the run diverged, oscillates, drifts or grows, or its loop has an exact root with
   a positive real part, and no proof says otherwise.
 - Open: everything else.
@@ -30,6 +31,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from ..errors import count_nouns
 from .run_end import EndBehaviour, RunEnd, Stability
 from .site_signals import SETTLED_ERROR_RAD
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeTrend
@@ -350,7 +352,7 @@ def _pushes_excuse_end(run: RunFindings) -> bool:
 
 
 def _has_settled(run: RunFindings) -> bool:
-    """Returns True if a run came to rest and every push died away."""
+    """Returns True if a run became slow, or was decaying, and every push died away."""
     end = run.end
     if not run.has_pushes:
         return False
@@ -370,7 +372,8 @@ def _describe_pushes(run: RunFindings) -> str:
     assert run.twins is not None
     pushes = len({growth.push.name for growth in run.twins.pushes})
     duration_s = run.twins.to_s
-    text = f"{pushes} pushes over {duration_s:.4g} s, all of which died away"
+    ending = "all of which died away" if pushes > 1 else "which died away"
+    text = f"{count_nouns(pushes, 'push', 'pushes')} over {duration_s:.4g} s, {ending}"
     roots = run.roots
     if roots is None:
         return text

@@ -169,11 +169,13 @@ def certify(
         The judgement with its reasons.
 
     Raises:
-        LogError: The log cannot be read.
+        LogError: The log cannot be read, or no site has a record in it.
     """
     from ..analysis import certify_run
 
-    return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws, twins=twins)
+    opened = _open(log)
+    opened.require_records()
+    return certify_run(opened, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 
 
 def metrics(log: AnyLog) -> LogMetrics:
@@ -192,9 +194,11 @@ def metrics(log: AnyLog) -> LogMetrics:
         The metrics of the run, of each site and of each link, with their units.
 
     Raises:
-        LogError: The log cannot be read.
+        LogError: The log cannot be read, or no site has a record in it.
     """
-    return compute_log_metrics(_open(log))
+    opened = _open(log)
+    opened.require_records()
+    return compute_log_metrics(opened)
 
 
 def choose_report_folder(log: Path) -> Path:
@@ -227,10 +231,12 @@ def report(
 
     Raises:
         UsageError: The folder is not empty, or the log is not in a file.
+        LogError: The log cannot be read, or no site has a record in it.
     """
     from ..presentation import conclude
 
     opened = _open(log)
+    opened.require_records()
     first = Path(opened.sources[0])
     if not first.is_file():
         raise UsageError(

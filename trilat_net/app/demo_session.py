@@ -399,6 +399,9 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
     # The cached code may be for chains with another number of joints.
     if has_chains or not is_core_cached():
         compiling_notice.report = say
+        # Loading the scenario may have compiled, and announced, a small part of the code. The
+        # main part takes far longer, so it is announced too.
+        compiling_notice.is_reported = False
         with interrupt.raising():
             for name in sites_by_counts.values():
                 warm_up(scenario, name)

@@ -21,6 +21,7 @@ __all__ = [
     # Ticks, records and modes
     "BUCKETS_PER_S",
     "MAX_ARRIVALS",
+    "RELEASE_REASONS",
     "CoreChange",
     "DominanceRamp",
     "LifeAlarm",
@@ -239,102 +240,324 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .arms.chain import (COULOMB_SPEED, ChainJoint, LINK_PARAMETERS, Matrix, Three, apply, build_chain, dot, find_acceleration, inverse_dynamics, mass_matrix, multiply, parameter_gradient, place_end_effector, place_joints, propagate_motion, rotate, three)
-    from .arms import chain_stages
-    from .arms.elementary import (sincos, tanh)
-    from .arms.exogenous import (LIVE_KINDS, NO_TORQUE, OWN_KINDS, SCRIPTED_KINDS, SourceTorque, TorqueKind, TorqueSource, TorqueTable, add_source_torque, torque_on_arm)
-    from .arms.rotation import (relative_rotation, rotation_matrix)
-    from .arms.task_space import (POSE, POSITION, add_task_torque, update_pose, update_task_errors)
-    from .arms.two_link_arm import (ArmLinks, forward_kinematics, regressor, theta_from_links)
-    from .arms import two_link_stages
-    from .life.live_hand import (GRIP_NS, HandCommand, HandInForce, HandMemory, HandReach, HandRules, SILENCE_NS, TAKEN, advance_hand, empty_hand_vector)
-    from .life.own_hand import (HandContext, HandProgram, HandView, OwnHand)
-    from .life.resting import (REST_RATE_1_S)
-    from .life.safeguards import (BLEND_S)
-    from .life.session_life import (HELD_OVERRUN_TICKS)
-    from .links.channel import (LOST, advance_losses, delay_sample, find_delay_us, find_due_ns, loses_samples, schedule_deliveries, select_model)
-    from .links.delay import (DELAY, DelayKind, LINK_MODEL_DTYPE, LOSS, LinkModel, MAX_DELAY_US, TraceEnd, clamp_delay_us, draw_delay_us, draw_pair, max_delay_us)
+    from .arms import chain_stages, two_link_stages
+    from .arms.chain import (
+        COULOMB_SPEED,
+        LINK_PARAMETERS,
+        ChainJoint,
+        Matrix,
+        Three,
+        apply,
+        build_chain,
+        dot,
+        find_acceleration,
+        inverse_dynamics,
+        mass_matrix,
+        multiply,
+        parameter_gradient,
+        place_end_effector,
+        place_joints,
+        propagate_motion,
+        rotate,
+        three,
+    )
+    from .arms.elementary import sincos, tanh
+    from .arms.exogenous import (
+        LIVE_KINDS,
+        NO_TORQUE,
+        OWN_KINDS,
+        SCRIPTED_KINDS,
+        SourceTorque,
+        TorqueKind,
+        TorqueSource,
+        TorqueTable,
+        add_source_torque,
+        torque_on_arm,
+    )
+    from .arms.rotation import relative_rotation, rotation_matrix
+    from .arms.task_space import (
+        POSE,
+        POSITION,
+        add_task_torque,
+        update_pose,
+        update_task_errors,
+    )
+    from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
+    from .life.live_hand import (
+        GRIP_NS,
+        SILENCE_NS,
+        TAKEN,
+        HandCommand,
+        HandInForce,
+        HandMemory,
+        HandReach,
+        HandRules,
+        advance_hand,
+        empty_hand_vector,
+    )
+    from .life.own_hand import HandContext, HandProgram, HandView, OwnHand
+    from .life.resting import REST_RATE_1_S
+    from .life.safeguards import BLEND_S
+    from .life.session_life import HELD_OVERRUN_TICKS
     from .links import dominance
-    from .links.dominance import (ROW_SUM_TOLERANCE, find_balancing_weights, find_reach, is_irreducible, perron_vector, update_reference)
-    from .links.link import (AHEAD_LIMIT_NS, ChannelArrays, LinkArrays, accept_sample, link_dtype, release_sample)
-    from .links.philox import (DrawKey, link_key, uniforms)
-    from .plug.compiled_law import (CHECKED, CompiledLaw, LawForm, collect_law_input, compiled, finish_law, plug_law)
-    from .plug.law_channel import (LawChannel, MAX_RECORD_SENT, MAX_SENT, SentVector)
-    from .plug.law_energy import (LawEnergies, LawRecords, PeerRecords, sum_work)
-    from .plug.law_view import (PlainLaw, update_law_view)
-    from .plug.plugged import (call_address, compile_to_address, digest_sibling_sources, list_numbers)
-    from .plug.user_law import (LawContext, LawInput, PeerView, UserLaw, UserLawFactory, list_remembered, read_memory)
-    from .step.control import (ROBUST_RESIDUE)
-    from .step.fingerprint import (compute_fingerprint)
-    from .step.fused_run import (LawArrays, NEVER_NS, PROGRESS_DTYPE, RecentRecords, ReplayedInputs, finish_site, first_sent_column, max_over_joints, run_until, sense_site, sums_dtype, update_peaks, update_sums)
-    from .step.jit import (compiling_notice, find_lane_address, is_core_cached, is_lane_code_stored, lane_leaf, leaf, loop_leaf, read_lane_assembly, set_lane_form)
-    from .step.kernel import (adapts, channel_of, emit_stages, finish_advance, guard_reference, hold_motor_torque, reference_stages, sum_trapezoid, torque_stage, updates_estimate)
-    from .step.recorded_ticks import (RecordedRows, TickRepeater)
-    from .step.row_fields import (LinkRow)
-    from .step.site_arrays import (MAX_CHANGES, MAX_LINKS_BYTES, MAX_RAMPS, SiteArrays, apply_change, links_bytes, needed_pages)
-    from .step.site_setup import (ChainSetup, Gains, Law, LinkSetup, MotionLimits, RestGains, Scheme, SiteSetup, StaleAction, StaleRule, TaskSetup, make_layout)
-    from .step.site_step import (Site)
-    from .step.ticks import (BUCKETS_PER_S, CoreChange, DominanceRamp, LifeAlarm, LifeOrder, LifeReason, MAX_ARRIVALS, PlantState, TickInput, describe_divergence, describe_mode, find_life_reason, first_tick_at, tick_ns)
-    from .step.vectors import (Array, IntArray, Pair, Points, Row, RowArray, Vector, choose, five, pair, put_pair, round_down, whole)
+    from .links.channel import (
+        LOST,
+        advance_losses,
+        delay_sample,
+        find_delay_us,
+        find_due_ns,
+        loses_samples,
+        schedule_deliveries,
+        select_model,
+    )
+    from .links.delay import (
+        DELAY,
+        LINK_MODEL_DTYPE,
+        LOSS,
+        MAX_DELAY_US,
+        DelayKind,
+        LinkModel,
+        TraceEnd,
+        clamp_delay_us,
+        draw_delay_us,
+        draw_pair,
+        max_delay_us,
+    )
+    from .links.dominance import (
+        ROW_SUM_TOLERANCE,
+        find_balancing_weights,
+        find_reach,
+        is_irreducible,
+        perron_vector,
+        update_reference,
+    )
+    from .links.link import (
+        AHEAD_LIMIT_NS,
+        ChannelArrays,
+        LinkArrays,
+        accept_sample,
+        link_dtype,
+        release_sample,
+    )
+    from .links.philox import DrawKey, link_key, uniforms
+    from .plug.compiled_law import (
+        CHECKED,
+        CompiledLaw,
+        LawForm,
+        collect_law_input,
+        compiled,
+        finish_law,
+        plug_law,
+    )
+    from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
+    from .plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
+    from .plug.law_view import PlainLaw, update_law_view
+    from .plug.plugged import (
+        call_address,
+        compile_to_address,
+        digest_sibling_sources,
+        list_numbers,
+    )
+    from .plug.user_law import (
+        LawContext,
+        LawInput,
+        PeerView,
+        UserLaw,
+        UserLawFactory,
+        list_remembered,
+        read_memory,
+    )
+    from .step.control import ROBUST_RESIDUE
+    from .step.fingerprint import compute_fingerprint
+    from .step.fused_run import (
+        NEVER_NS,
+        PROGRESS_DTYPE,
+        LawArrays,
+        RecentRecords,
+        ReplayedInputs,
+        finish_site,
+        first_sent_column,
+        max_over_joints,
+        run_until,
+        sense_site,
+        sums_dtype,
+        update_peaks,
+        update_sums,
+    )
+    from .step.jit import (
+        compiling_notice,
+        find_lane_address,
+        is_core_cached,
+        is_lane_code_stored,
+        lane_leaf,
+        leaf,
+        loop_leaf,
+        read_lane_assembly,
+        set_lane_form,
+    )
+    from .step.kernel import (
+        adapts,
+        channel_of,
+        emit_stages,
+        finish_advance,
+        guard_reference,
+        hold_motor_torque,
+        reference_stages,
+        sum_trapezoid,
+        torque_stage,
+        updates_estimate,
+    )
+    from .step.recorded_ticks import RecordedRows, TickRepeater
+    from .step.row_fields import LinkRow
+    from .step.site_arrays import (
+        MAX_CHANGES,
+        MAX_LINKS_BYTES,
+        MAX_RAMPS,
+        SiteArrays,
+        apply_change,
+        links_bytes,
+        needed_pages,
+    )
+    from .step.site_setup import (
+        ChainSetup,
+        Gains,
+        Law,
+        LinkSetup,
+        MotionLimits,
+        RestGains,
+        Scheme,
+        SiteSetup,
+        StaleAction,
+        StaleRule,
+        TaskSetup,
+        make_layout,
+    )
+    from .step.site_step import Site
+    from .step.ticks import (
+        BUCKETS_PER_S,
+        MAX_ARRIVALS,
+        RELEASE_REASONS,
+        CoreChange,
+        DominanceRamp,
+        LifeAlarm,
+        LifeOrder,
+        LifeReason,
+        PlantState,
+        TickInput,
+        describe_divergence,
+        describe_mode,
+        find_life_reason,
+        first_tick_at,
+        tick_ns,
+    )
+    from .step.vectors import (
+        Array,
+        IntArray,
+        Pair,
+        Points,
+        Row,
+        RowArray,
+        Vector,
+        choose,
+        five,
+        pair,
+        put_pair,
+        round_down,
+        whole,
+    )
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "arms.chain": ("COULOMB_SPEED ChainJoint LINK_PARAMETERS Matrix Three apply build_chain "
-"dot find_acceleration inverse_dynamics mass_matrix multiply "
-"parameter_gradient place_end_effector place_joints propagate_motion rotate "
-"three"),
+            "arms.chain": (
+                "COULOMB_SPEED ChainJoint LINK_PARAMETERS Matrix Three apply build_chain "
+                "dot find_acceleration inverse_dynamics mass_matrix multiply "
+                "parameter_gradient place_end_effector place_joints propagate_motion rotate "
+                "three"
+            ),
             "arms.chain_stages": "chain_stages",
             "arms.elementary": "sincos tanh",
-            "arms.exogenous": ("LIVE_KINDS NO_TORQUE OWN_KINDS SCRIPTED_KINDS SourceTorque TorqueKind "
-"TorqueSource TorqueTable add_source_torque torque_on_arm"),
+            "arms.exogenous": (
+                "LIVE_KINDS NO_TORQUE OWN_KINDS SCRIPTED_KINDS SourceTorque TorqueKind "
+                "TorqueSource TorqueTable add_source_torque torque_on_arm"
+            ),
             "arms.rotation": "relative_rotation rotation_matrix",
             "arms.task_space": "POSE POSITION add_task_torque update_pose update_task_errors",
             "arms.two_link_arm": "ArmLinks forward_kinematics regressor theta_from_links",
             "arms.two_link_stages": "two_link_stages",
-            "life.live_hand": ("GRIP_NS HandCommand HandInForce HandMemory HandReach HandRules SILENCE_NS "
-"TAKEN advance_hand empty_hand_vector"),
+            "life.live_hand": (
+                "GRIP_NS HandCommand HandInForce HandMemory HandReach HandRules SILENCE_NS "
+                "TAKEN advance_hand empty_hand_vector"
+            ),
             "life.own_hand": "HandContext HandProgram HandView OwnHand",
             "life.resting": "REST_RATE_1_S",
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
-            "links.channel": ("LOST advance_losses delay_sample find_delay_us find_due_ns loses_samples "
-"schedule_deliveries select_model"),
-            "links.delay": ("DELAY DelayKind LINK_MODEL_DTYPE LOSS LinkModel MAX_DELAY_US TraceEnd "
-"clamp_delay_us draw_delay_us draw_pair max_delay_us"),
-            "links.dominance": ("ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
-"is_irreducible perron_vector update_reference"),
-            "links.link": ("AHEAD_LIMIT_NS ChannelArrays LinkArrays accept_sample link_dtype "
-"release_sample"),
+            "links.channel": (
+                "LOST advance_losses delay_sample find_delay_us find_due_ns loses_samples "
+                "schedule_deliveries select_model"
+            ),
+            "links.delay": (
+                "DELAY DelayKind LINK_MODEL_DTYPE LOSS LinkModel MAX_DELAY_US TraceEnd "
+                "clamp_delay_us draw_delay_us draw_pair max_delay_us"
+            ),
+            "links.dominance": (
+                "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
+                "is_irreducible perron_vector update_reference"
+            ),
+            "links.link": (
+                "AHEAD_LIMIT_NS ChannelArrays LinkArrays accept_sample link_dtype "
+                "release_sample"
+            ),
             "links.philox": "DrawKey link_key uniforms",
-            "plug.compiled_law": ("CHECKED CompiledLaw LawForm collect_law_input compiled finish_law plug_law"),
+            "plug.compiled_law": (
+                "CHECKED CompiledLaw LawForm collect_law_input compiled finish_law plug_law"
+            ),
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
             "plug.law_energy": "LawEnergies LawRecords PeerRecords sum_work",
             "plug.law_view": "PlainLaw update_law_view",
-            "plug.plugged": ("call_address compile_to_address digest_sibling_sources list_numbers"),
-            "plug.user_law": ("LawContext LawInput PeerView UserLaw UserLawFactory list_remembered "
-"read_memory"),
+            "plug.plugged": (
+                "call_address compile_to_address digest_sibling_sources list_numbers"
+            ),
+            "plug.user_law": (
+                "LawContext LawInput PeerView UserLaw UserLawFactory list_remembered "
+                "read_memory"
+            ),
             "step.control": "ROBUST_RESIDUE",
             "step.fingerprint": "compute_fingerprint",
-            "step.fused_run": ("LawArrays NEVER_NS PROGRESS_DTYPE RecentRecords ReplayedInputs finish_site "
-"first_sent_column max_over_joints run_until sense_site sums_dtype "
-"update_peaks update_sums"),
-            "step.jit": ("compiling_notice find_lane_address is_core_cached is_lane_code_stored "
-"lane_leaf leaf loop_leaf read_lane_assembly set_lane_form"),
-            "step.kernel": ("adapts channel_of emit_stages finish_advance guard_reference "
-"hold_motor_torque reference_stages sum_trapezoid torque_stage "
-"updates_estimate"),
+            "step.fused_run": (
+                "LawArrays NEVER_NS PROGRESS_DTYPE RecentRecords ReplayedInputs finish_site "
+                "first_sent_column max_over_joints run_until sense_site sums_dtype "
+                "update_peaks update_sums"
+            ),
+            "step.jit": (
+                "compiling_notice find_lane_address is_core_cached is_lane_code_stored "
+                "lane_leaf leaf loop_leaf read_lane_assembly set_lane_form"
+            ),
+            "step.kernel": (
+                "adapts channel_of emit_stages finish_advance guard_reference "
+                "hold_motor_torque reference_stages sum_trapezoid torque_stage "
+                "updates_estimate"
+            ),
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.row_fields": "LinkRow",
-            "step.site_arrays": ("MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays apply_change links_bytes "
-"needed_pages"),
-            "step.site_setup": ("ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
-"StaleAction StaleRule TaskSetup make_layout"),
+            "step.site_arrays": (
+                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays apply_change links_bytes "
+                "needed_pages"
+            ),
+            "step.site_setup": (
+                "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
+                "StaleAction StaleRule TaskSetup make_layout"
+            ),
             "step.site_step": "Site",
-            "step.ticks": ("BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
-"MAX_ARRIVALS PlantState TickInput describe_divergence describe_mode "
-"find_life_reason first_tick_at tick_ns"),
-            "step.vectors": ("Array IntArray Pair Points Row RowArray Vector choose five pair put_pair "
-"round_down whole"),
+            "step.ticks": (
+                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
+                "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_divergence "
+                "describe_mode find_life_reason first_tick_at tick_ns"
+            ),
+            "step.vectors": (
+                "Array IntArray Pair Points Row RowArray Vector choose five pair put_pair "
+                "round_down whole"
+            ),
         },
     )

@@ -41,15 +41,21 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .fused import (FusedRun, RunTotals, check_fusable, explain_not_repeatable)
-    from .lanes.run_groups import (LEAST_RUNS, RunGroup, group_runs)
-    from .log_checks import (LogCheckReport, check_log_files)
-    from .rerun_execution import (describe_rerun_changes)
-    from .twins import (LEAST_PUSH, MOST_PUSH, PUSH_RAD, Push, SMALLEST, TwinPath, Twins)
-    from .verification import (verify)
-    from .virtual import (SimulatedLog, check_virtual, execute_virtual, record_virtual, simulate_scenario)
-    from .virtual_comparison import (find_absent_samples, simulate_without_operators)
-    from .what_if import (LinkEffect, Rerun, SiteEffect, rerun)
+    from .fused import FusedRun, RunTotals, check_fusable, explain_not_repeatable
+    from .lanes.run_groups import LEAST_RUNS, RunGroup, group_runs
+    from .log_checks import LogCheckReport, check_log_files
+    from .rerun_execution import describe_rerun_changes
+    from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
+    from .verification import verify
+    from .virtual import (
+        SimulatedLog,
+        check_virtual,
+        execute_virtual,
+        record_virtual,
+        simulate_scenario,
+    )
+    from .virtual_comparison import find_absent_samples, simulate_without_operators
+    from .what_if import LinkEffect, Rerun, SiteEffect, rerun
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -60,8 +66,9 @@ else:
             "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "verification": "verify",
-            "virtual": ("SimulatedLog check_virtual execute_virtual record_virtual "
-"simulate_scenario"),
+            "virtual": (
+                "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
+            ),
             "virtual_comparison": "find_absent_samples simulate_without_operators",
             "what_if": "LinkEffect Rerun SiteEffect rerun",
         },

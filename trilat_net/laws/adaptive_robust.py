@@ -132,7 +132,7 @@ class AdaptiveRobust(AdaptiveBox):
         text = (
             f"delays are {delays}, theta is in its box: with torque of at most rho_nm that no "
             "estimate explains, the mean of beta times r'Kp r and the disagreement is at most "
-            f"beta times {bound_w:.3g} W here; sufficient"
+            f"beta times {bound_w:.3g} W here; sufficient, in continuous time"
         )
         return StabilityCondition(None if delays_vary else True, text)
 

@@ -171,7 +171,10 @@ class Authority(ControlLaw):
             if getattr(law, "leads", False):
                 users.append(n)
         if situation.site not in users:
-            text = "it follows and closes no loop: stable for every delay and d > 0"
+            text = (
+                "it follows and closes no loop: stable in continuous time for every delay and "
+                "d > 0"
+            )
             return StabilityCondition(True, text)
         loop_of_users = situation.restrict(users)
         return judge_position_exchange(loop_of_users, "K", "d")

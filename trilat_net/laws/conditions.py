@@ -171,7 +171,10 @@ def judge_position_exchange(
         # The stiffness belongs to coordinates of the end effector, and the damping to joints.
         return StabilityCondition(None, "known for joints that follow joints")
     if not situation.alpha.any():
-        text = "nobody follows anybody, which closes no loop: stable at every delay and d > 0"
+        text = (
+            "nobody follows anybody, which closes no loop: stable in continuous time at every "
+            "delay and d > 0"
+        )
         return StabilityCondition(True, text)
     hold_s = situation.hold_s
     K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
@@ -185,7 +188,7 @@ def judge_position_exchange(
         text = "known of held torques for sites of one tick rate"
         return StabilityCondition(None, text)
 
-    scope = "sufficient whatever the masses"
+    scope = "sufficient in continuous time, whatever the masses"
     if hold_s:
         damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
         least_inertia = 0.5 * float(d.max()) * hold_s

@@ -179,8 +179,9 @@ class Sync(ControlLaw):
             return StabilityCondition(None, text)
         text = (
             "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 "
-            "(sufficient); but under gravity the arms end where Y_G' r = 0, at q = 0 or "
-            "hanging (cos q1 = 0 and cos(q1 + q2) = 0), wherever users move them"
+            "(sufficient, in continuous time); but under gravity the arms end where "
+            "Y_G' r = 0, at q = 0 or hanging (cos q1 = 0 and cos(q1 + q2) = 0), wherever users "
+            "move them"
         )
         return StabilityCondition(True, text)
 

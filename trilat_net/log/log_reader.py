@@ -169,6 +169,23 @@ class Log(Result, Mapping[str, SiteLog]):
         state = "" if self.complete else "; not finished"
         return f"{self.source}: {kind}; {summary}{state}"
 
+    @property
+    def why_empty(self) -> str:
+        """A clause that no site has a record in this log. Empty if a site has a record."""
+        has_records = any(len(self[name]) for name in self.sites)
+        return "" if has_records else "no site has a record in this log"
+
+    def require_records(self) -> None:
+        """Raises an error if no site has a record, so that there is nothing to judge.
+
+        Raises:
+            LogError: No site has a record.
+        """
+        if self.why_empty:
+            raise LogError(
+                f"{self.source}: {self.why_empty}, so that there is nothing to judge"
+            )
+
     def _describe_records(self) -> str:
         """Returns the length of the session and the numbers of its records, as a string."""
         last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]

@@ -33,7 +33,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
 
-from ..core import GRIP_NS, SILENCE_NS, HandInForce, LifeReason, TorqueKind, TorqueSource
+from ..core import GRIP_NS, RELEASE_REASONS, SILENCE_NS, HandInForce, TorqueKind, TorqueSource
 from ..errors import UsageError, WireError
 from . import topics
 from .bus import Bus
@@ -438,7 +438,8 @@ class ArmClient(_OutsideClient):
         - before the first tick and after the run,
         - if the newest record is older than `FRESH_NS`,
         - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
-          torque brings the arm to rest.
+          torque brings the arm to rest. If the switch is released while the arm is stopped by
+          order, this time counts from the stop.
 
         Returns:
             The torque in N m per joint. None if the arm must brake.
@@ -456,7 +457,8 @@ class ArmClient(_OutsideClient):
         reason_index = 2 * n + 1
         begun_ns = record.mem[begun_index : begun_index + 1]
         stop_reason = record.mem[reason_index : reason_index + 1]
-        is_switch_released = record.mode == "stopped" and stop_reason == [LifeReason.RELEASED]
+        was_released = bool(stop_reason) and stop_reason[0] in RELEASE_REASONS
+        is_switch_released = record.mode == "stopped" and was_released
         must_brake_soon = record.mode == "fault" or is_switch_released
         if must_brake_soon:
             is_coming_to_rest = bool(begun_ns) and record.t_ns - begun_ns[0] < _BRAKE_NS

@@ -50,6 +50,8 @@ _KEY_METRICS = (
     "effort_nm2_s",
 )
 """Keys of metrics, the most important first. The first ten that a run has are printed."""
+_PREMISES = "premises are what the theorem requires (docs/reference/certificate-premises.md)"
+"""Explanation of a word that `trilat certify` uses."""
 _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
 """Importance of a line of a certificate, by its mark."""
 
@@ -72,7 +74,8 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
     if certificate.balance is not None:
         parts.append("the energies")
     if parts:
-        yield f"--all prints {' and '.join(parts)} too"
+        more = f"--all prints {' and '.join(parts)} too"
+        yield f"{more}; {_PREMISES}" if premises else more
 
 
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:

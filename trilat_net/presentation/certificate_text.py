@@ -21,6 +21,7 @@ import numpy as np
 
 from ..analysis import (
     NEGATIVE_ENERGY_MEANING,
+    SETTLED_ERROR_RAD,
     ZERO_ENERGY_J,
     Certificate,
     EndBehaviour,
@@ -28,11 +29,11 @@ from ..analysis import (
     EnvelopeTrend,
     LoopRoots,
     ObservedFinding,
-    Premise,
     PushedTwins,
     Stability,
-    StabilityFinding,
     TwinGrowth,
+    premise_quantities,
+    verdict_facts,
 )
 from ..core import Array
 from ..errors import count_nouns
@@ -48,6 +49,18 @@ _SOURCE_NAMES = {
     "estimates": "box, or wrong estimates",
 }
 """Texts of the sources of energy other than links, by their names in a balance."""
+
+_OTHER_ENDS = {
+    EndBehaviour.CONVERGED: "the record ends with slow arms",
+    EndBehaviour.DECAYS: "the motion decays at the end of the record",
+    EndBehaviour.HARDLY: "the motion hardly decays at the end of the record",
+    EndBehaviour.UNDECIDED: "the record alone decides nothing",
+    EndBehaviour.COASTS: "an arm coasts at the end of the record",
+    EndBehaviour.BOUNDED: "the arms still swing at the end of the record",
+    EndBehaviour.DRIFTS: "an arm still drifts at the end of the record",
+    EndBehaviour.GROWS: "the motion still grows at the end of the record",
+}
+"""Clauses about the end of a record that alone would be judged otherwise than its run."""
 
 _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
@@ -86,7 +99,7 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         yield TextTable(("energy", "J"), cells, align="lr")
 
 
-def select_premises(certificate: Certificate) -> list[Premise]:
+def select_premises(certificate: Certificate) -> list[premise_quantities.Premise]:
     """Returns the premises that apply to the control laws of a run.
 
     The premises of the stability theorem concern its energy function V. They are left out for
@@ -103,7 +116,7 @@ def select_premises(certificate: Certificate) -> list[Premise]:
     return premises
 
 
-def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
+def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTable:
     """Returns a table with a row per premise: whether it holds, and why."""
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     styles = {"holds": "green", "fails": "yellow"}
@@ -215,7 +228,7 @@ def _explain_judgement(certificate: Certificate) -> str:
         return ""
     if stability is Stability.SETTLED:
         return (
-            "every small push died away and the arms came to rest, but no proof exists; "
+            f"{describe_settling(certificate)}; "
             "`trilat certify --accept settled` takes this for a success"
         )
     pace = describe_pace(certificate)
@@ -224,9 +237,24 @@ def _explain_judgement(certificate: Certificate) -> str:
     pace = pace or "small disturbances die away"
     if not certificate.has_functional:
         return f"{pace}; the theorem of the paper is about another control law"
-    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+    if certificate.verdict.finding is verdict_facts.StabilityFinding.DID_NOT_RISE:
         return f"{pace}; the theorem of the paper does not apply here and is not needed"
     return pace
+
+
+def describe_settling(certificate: Certificate) -> str:
+    """Returns what was seen of a settled run, and that nothing proves more, as a clause.
+
+    A settled run has become slow, or its motion decays. Its arms need not be at rest.
+
+    Args:
+        certificate: Judgement of a run that settled, with its reasons.
+    """
+    speed = f"{certificate.end.end_speed_rad_s:.2g} rad/s"
+    return (
+        f"every small push died away and no joint was faster than {speed} at the end, but no "
+        "proof exists"
+    )
 
 
 def describe_pace(certificate: Certificate) -> str:
@@ -252,9 +280,9 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     """Returns the judgement, the verdict about V, and the end of the run."""
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
-    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+    if certificate.verdict.finding is verdict_facts.StabilityFinding.DID_NOT_RISE:
         verdict_mark = "note"  # a theorem that does not apply has neither held nor failed
-    if certificate.verdict.finding is StabilityFinding.BROKEN:
+    if certificate.verdict.finding is verdict_facts.StabilityFinding.BROKEN:
         stability_mark = "FAIL"
         verdict_mark = "FAIL"
     lines = [CertificateLine(stability_mark, describe_judgement(certificate))]
@@ -337,6 +365,47 @@ def _describe_paper_weights(certificate: Certificate) -> str:
     return f"with the paper's weights, ones, {sentence} (docs/theory/errata-proof.md, 6)"
 
 
+def compose_headline(certificate: Certificate) -> str:
+    """Returns the judgement of a run and its basis in one line.
+
+    For example "stable: converged; rests on: exact roots, slowest -0.832 /s". If the arms
+    exceeded their limits, the line says which joint did so, and when.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    end = certificate.end
+    if end.behaviour is EndBehaviour.DIVERGED:
+        return f"{certificate.stability}: {end.text}"
+    stability = certificate.stability
+    end_alone = end.behaviour.stability
+    text = f"{stability}: {_describe_end(certificate)}"
+    # A proof, or the growth of pushes, may decide otherwise than the record alone.
+    if stability is Stability.STABLE and end_alone is not Stability.SETTLED:
+        text = f"stable by proof, although {_OTHER_ENDS[end.behaviour]}"
+    elif stability is Stability.NOT_STABLE and end_alone is not Stability.NOT_STABLE:
+        text = f"not stable, although {_OTHER_ENDS[end.behaviour]}"
+    rests_on = certificate.decision.rests_on
+    return f"{text}; rests on: {rests_on}" if rests_on else text
+
+
+def _describe_end(certificate: Certificate) -> str:
+    """Returns how a run ends, as a phrase that does not claim more than its judgement."""
+    end = certificate.end
+    if certificate.stability is not Stability.SETTLED:
+        return end.phrase
+    if end.behaviour is EndBehaviour.DECAYS:
+        error = f"|e| {end.end_error_rad:.2g} {end.error_unit}"
+        return f"{end.phrase}, with {error} and |qd| {end.end_speed_rad_s:.2g} rad/s at the end"
+    if end.stability is Stability.SETTLED:
+        return end.phrase
+    # The speed of the arms, times the length of the judged part, is below this limit.
+    return (
+        f"too slow to move by {SETTLED_ERROR_RAD:g} rad in the judged part, |qd| "
+        f"{end.end_speed_rad_s:.2g} rad/s"
+    )
+
+
 def describe_judgement(certificate: Certificate) -> str:
     """Returns the judgement whether a run was stable, in one line.
 
@@ -358,7 +427,7 @@ def describe_judgement(certificate: Certificate) -> str:
         new = reason.removeprefix(certificate.end.text).removeprefix("; ")
         if new:
             reasons.append(new)
-    return "; ".join([certificate.headline(), *reasons])
+    return "; ".join([compose_headline(certificate), *reasons])
 
 
 _JUDGEMENT_MARKS = {
@@ -368,8 +437,8 @@ _JUDGEMENT_MARKS = {
     Stability.OPEN: "open",
 }
 _BALANCE_MARKS = {
-    StabilityFinding.BROKEN: "FAIL",
-    StabilityFinding.NOT_JUDGED: "open",
+    verdict_facts.StabilityFinding.BROKEN: "FAIL",
+    verdict_facts.StabilityFinding.NOT_JUDGED: "open",
 }
 _OBSERVED_MARKS = {
     ObservedFinding.PASSIVE: "ok",

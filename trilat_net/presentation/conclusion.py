@@ -204,11 +204,18 @@ def conclude(
         )
     untimed = explain_missing_loop_times(log)
     timing_lines = [untimed] if untimed else []
+    verdict = describe_certificate(certificate)[0]
+    meaning = describe_in_words(certificate)
+    theorem = describe_theorem(certificate)
+    if log.why_empty:
+        verdict = CertificateLine("FAIL", f"nothing to judge: {log.why_empty}")
+        meaning = []
+        theorem = []
     return Conclusion(
-        verdict=describe_certificate(certificate)[0],
-        meaning=describe_in_words(certificate),
+        verdict=verdict,
+        meaning=meaning,
         table=_tabulate_sites(log, is_timed=not untimed),
-        notes=[*timing_lines, *run_lines, *describe_theorem(certificate)],
+        notes=[*timing_lines, *run_lines, *theorem],
         findings=findings,
         paths=[*map(Path, log.sources), *report, *figures],
     )

@@ -33,7 +33,7 @@ from ..errors import count_nouns, join_words
 from ..log import Finding, Log
 from ..results import JsonObject
 from ..scenario import END_WINDOW_S
-from .certificate_text import describe_pace
+from .certificate_text import describe_pace, describe_settling
 from .html_templates import render_macro
 from .page_html import NO_NUMBER, format_cell, render_details
 from .plot_signals import shared_unit
@@ -46,11 +46,10 @@ _SEVERE_ALARMS = ("FAULT", "STOPPED")
 
 _MEANINGS = {
     Stability.STABLE: "A proof holds for this loop, and the run agrees with it",
-    Stability.SETTLED: "Small pushes died away and the arms came to rest, but no proof exists",
     Stability.NOT_STABLE: "The motion of this loop does not come to rest",
     Stability.OPEN: "Nothing decides whether this loop is stable",
 }
-"""What each judgement means."""
+"""What each judgement means. The meaning of a settled run has numbers, see `_explain_word`."""
 _ROOTS_AND_THEOREM = (
     "This proof is about small motions near the final pose. The paper's theorem, which "
     "is examined below, is another proof, and this one does not need it."
@@ -64,7 +63,6 @@ _MARKS = {
 }
 """Style of each judgement."""
 _ENDS = {
-    EndBehaviour.CONVERGED: "the arms were at rest and agreed",
     EndBehaviour.DECAYS: "the motion was dying away",
     EndBehaviour.HARDLY: "the motion was hardly dying away",
     EndBehaviour.UNDECIDED: "the motion showed no trend, so that a longer record is needed",
@@ -74,7 +72,10 @@ _ENDS = {
     EndBehaviour.GROWS: "the motion grew",
     EndBehaviour.DIVERGED: "a joint had exceeded its limit of speed",
 }
-"""How the arms moved at the end of a run, as a clause in the past tense."""
+"""How the arms moved at the end of a run, as a clause in the past tense.
+
+The clause about a run that converged has numbers, see `_explain_end`.
+"""
 
 
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
@@ -85,6 +86,16 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
         certificate: The judgement, with its reasons.
         findings: Results of the checks of the log. The judgement is in doubt if one failed.
     """
+    if log.why_empty:
+        return render_macro(
+            "summary.html",
+            "verdict",
+            css_class="bad",
+            word="Nothing to judge",
+            basis=f"{_start_sentence(log.why_empty)}.",
+            explanation="",
+            remarks="",
+        )
     word = certificate.stability.value
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
@@ -133,7 +144,7 @@ def describe_basis(certificate: Certificate) -> str:
     decision = certificate.decision
     if certificate.end.behaviour is EndBehaviour.DIVERGED:
         return f"The run {decision.rests_on}."
-    meaning = _MEANINGS[decision.stability]
+    meaning = _explain_word(certificate)
     if decision.stability is Stability.STABLE:
         basis = decision.rests_on.replace("; ", ", and ")
         return f"{meaning}: {basis}."
@@ -142,6 +153,13 @@ def describe_basis(certificate: Certificate) -> str:
     reason, *others = [text for text in (decision.rests_on, *decision.reasons) if text]
     more = f" ({count_nouns(len(others), 'more reason')} below)" if others else ""
     return f"{meaning} – {reason}{more}."
+
+
+def _explain_word(certificate: Certificate) -> str:
+    """Returns what the judgement of a run means, as a clause."""
+    if certificate.stability is Stability.SETTLED:
+        return _start_sentence(describe_settling(certificate))
+    return _MEANINGS[certificate.stability]
 
 
 def _explain_end(log: Log, certificate: Certificate) -> str:
@@ -157,10 +175,12 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     is_stable = stability in (Stability.STABLE, Stability.SETTLED)
     remains = end.end_error_rad > SETTLED_ERROR_RAD
     has_converged = end.behaviour is EndBehaviour.CONVERGED
-    if has_converged and remains:
-        clause = "the arms were at rest, with errors that stay"
+    if has_converged:
+        clause = f"no joint was faster than {end.end_speed_rad_s:.2g} rad/s"
+        largest = f"no error was above {end.end_error_rad:.2g} {end.error_unit}"
+        clause = f"{clause}, and errors stay" if remains else f"{clause}, and {largest}"
     elif is_stable and end.behaviour is EndBehaviour.UNDECIDED:
-        clause = "the motion showed no trend yet, which the evidence above does not need"
+        clause = "the motion alone decided nothing, and the evidence above does not need it"
     else:
         clause = _ENDS[end.behaviour]
     text = f"At the end of the record, {clause}."

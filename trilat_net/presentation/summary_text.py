@@ -29,17 +29,20 @@ from ..analysis import (
     LogMetrics,
     Metric,
     Quantity,
+    RunView,
     StatedModel,
     find_mode_intervals,
     link_summary,
     list_alarms,
     list_changes,
+    measure_undelayed_error,
     quantities,
 )
 from ..errors import count_nouns
 from ..execution import LinkEffect, LogCheckReport, Rerun, SiteEffect, describe_rerun_changes
 from ..log import Log, LogCheckResult, Recovery
 from ..results import Result
+from .plot_signals import shared_unit
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .untrusted_text import sanitize
 
@@ -387,24 +390,33 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
     changes = describe_rerun_changes(request)
     for line in changes or ["nothing is changed: this is the experiment of the log"]:
         yield f"  {line}"
+    undelayed = _compare_undelayed_errors(rerun)
     rows = []
     for effect in rerun.sites.values():
+        pairs: list[tuple[float, float] | None] = []
+        pairs += [effect.error_rms_rad, effect.error_max_rad]
+        if undelayed:
+            pairs.append(undelayed.get(effect.site))
+        pairs.append(effect.torque_max_nm)
         cells = []
-        for pair in (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm):
+        for pair in pairs:
             cells += ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
         rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
-    headers = (
-        "site",
-        "ticks",
-        "identical",
-        "rms e rad",
-        "rerun",
-        "max e rad",
-        "rerun",
-        "max tau N m",
-        "rerun",
-    )
-    yield TextTable(headers, rows, align="lr")
+    headers = ["site", "ticks", "identical", "rms e rad", "rerun", "max e rad", "rerun"]
+    if undelayed:
+        headers += ["undelayed", "rerun"]
+    headers += ["max tau N m", "rerun"]
+    yield TextTable(tuple(headers), rows, align="lr")
+    if undelayed:
+        unit = "rad" if shared_unit(rerun.before) == "rad" else "m"
+        yield (
+            f"undelayed: largest distance in {unit} from where the peers are at the same time, "
+            "delay included"
+        )
+        yield (
+            "e: error from what the site had received of its peers, which a longer delay "
+            "need not raise"
+        )
     for effect in rerun.sites.values():
         rate_hz = request.scenario.sites[effect.site].rate_hz
         for line in _describe_site_effect(effect, rate_hz):
@@ -413,6 +425,26 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
         if link.differs:
             yield _describe_link_effect(link)
     yield from (f"note: {note}" for note in rerun.notes)
+
+
+def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
+    """Returns the largest undelayed error of each executed site, in the log and in the rerun.
+
+    Both are taken over the times of which the log and the rerun have a record. Sites without
+    such an error, for example because they follow nobody, are left out.
+    """
+    log = RunView(rerun.before)
+    repeated = RunView(rerun.after)
+    key = "undelayed_max_rad" if shared_unit(rerun.before) == "rad" else "undelayed_max_m"
+    errors = {}
+    for site, effect in rerun.sites.items():
+        if not effect.compared:
+            continue
+        before = measure_undelayed_error(log, site, repeated)[key].value
+        after = measure_undelayed_error(repeated, site, log)[key].value
+        if before is not None and after is not None:
+            errors[site] = (before, after)
+    return errors
 
 
 def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:

@@ -177,14 +177,25 @@ def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, 
         yield name, scenario.controls[n], situation
 
 
-def describe_law_conditions(scenario: Scenario) -> list[str]:
+_LOOP_GROWS = ", but the roots of the sampled loop grow"
+"""What is said of a condition that holds if the loop is unstable."""
+_SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
+"""The same of a condition that proves decay in continuous time."""
+
+
+def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> list[str]:
     """Returns lines for the user that say whether the conditions of the stability proofs hold.
 
     Every control law is stable under conditions of its own, for example on its gains and on the
     delays. Sites with the same law and the same condition share a line.
 
+    Most conditions are proved for controllers that act in continuous time. A controller that
+    acts once per tick may be unstable although its condition holds.
+
     Args:
         scenario: Description of the experiment.
+        ticks_grow: True if the loop, computed tick by tick, is known to be unstable. The lines
+            of conditions that hold then say so.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in list_law_situations(scenario):
@@ -192,11 +203,14 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
         if condition:
             owners.setdefault((law.tag, condition), []).append(name)
     verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
-    return [
-        f"condition of {tag} at {', '.join(sites)} {verdicts[condition.holds]}: "
-        f"{condition.text}"
-        for (tag, condition), sites in owners.items()
-    ]
+    lines = []
+    for (tag, condition), sites in owners.items():
+        verdict = verdicts[condition.holds]
+        line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
+        if ticks_grow and condition.holds:
+            line += _SAMPLING_BREAKS if condition.proves_decay else _LOOP_GROWS
+        lines.append(line)
+    return lines
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
@@ -550,6 +564,11 @@ _MAX_VALUE_LENGTH = 80
 """Largest length of the text of a value."""
 
 
+_EVERY_LINK = "every link"
+_SOME_LINKS = "link "
+"""Start of the key of a difference of some links, which their names follow."""
+
+
 class ScenarioDifference(NamedTuple):
     """One key in which several experiments differ, as a row of a comparison.
 
@@ -563,6 +582,11 @@ class ScenarioDifference(NamedTuple):
     key: str
     owners: tuple[str, ...]
     values: tuple[str, ...]
+
+    @property
+    def concerns_link(self) -> bool:
+        """True if the difference is one of links, as in "every link" or "link m1->s"."""
+        return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
         """Returns the key and the sites."""
@@ -638,7 +662,9 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
             names_by_values.setdefault(values, []).append(name)
     differences = []
     for values, names in names_by_values.items():
-        key = "every link" if names == common_names else f"link {', '.join(names)}"
+        key = _SOME_LINKS + ", ".join(names)
+        if names == common_names:
+            key = _EVERY_LINK
         differences.append(ScenarioDifference(key, (), values))
     return differences
 

@@ -241,12 +241,32 @@ def check_keys(
         if key in valid:
             continue
         key_path = f"{path}.{key}" if path else key
-        hint = suggest_nearest(key, valid, elsewhere)
+        hint = hint_at_quotes(key) or suggest_nearest(key, valid, elsewhere)
         if not hint:
             choices = ", ".join(valid)
             hint = f"; valid keys are {choices}"
         raise ScenarioError(f"unknown key{hint}", path=key_path)
     return table
+
+
+def hint_at_quotes(text: str) -> str:
+    """Returns a hint for a text that a shell has cut off at the ">" of the name of a link.
+
+    A shell takes ">" outside quotes as an order to write into a file. Of
+    `links.m1->s.delay_ms=5` the program then receives "links.m1-".
+
+    Args:
+        text: A key or an override.
+
+    Returns:
+        The end of a sentence. Empty if the text does not end like this.
+    """
+    if not text.endswith("-"):
+        return ""
+    return (
+        "; a shell cuts a text off at > and writes a file: put the whole text in quotes, as in "
+        "'links.m1->s.delay_ms=5'"
+    )
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:

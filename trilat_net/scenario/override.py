@@ -20,7 +20,7 @@ from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import TomlTable
 from ..own_code import ImportedLaw, name_law_classes
 from .delay_models import DELAY_MODELS
-from .key_checks import check_keys, field_names
+from .key_checks import check_keys, field_names, hint_at_quotes
 from .laws import LAWS
 from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario
@@ -29,6 +29,9 @@ _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
 """Groups in which other keys depend on a kind, and the keys that name this kind."""
 _USER_LAW = "own"
 """Kind of all control laws that users wrote."""
+
+_WRONG_VALUE = "expected "
+"""Start of the problem of a value that has a wrong type or range."""
 
 Override = tuple[str, Any]
 """Dotted key and its new value."""
@@ -388,10 +391,73 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
         pair = split_assignment(str(text))
         if pair is None:
             raise ScenarioError(
-                f"an override must have the form KEY=VALUE, as in control.Kd=5, not {text!r}"
+                "an override must have the form KEY=VALUE, as in control.Kd=5, not "
+                f"{text!r}{hint_at_quotes(str(text))}"
             )
         pairs.append(pair)
     return pairs
+
+
+def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
+    """Returns the path of a wrong key as its author wrote it.
+
+    The author may have set the key for all sites or links at once. For example, the path
+    "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. Values of a
+    wrong type or range are wrong for every site or link. Other errors, such as a list of the
+    wrong length, may concern only the site that they name, so their paths stay.
+
+    Args:
+        error: The error, with the path of the key of a single site or link. An index in square
+            brackets may follow.
+        tables: Tables with the keys that the author wrote.
+
+    Returns:
+        The path of the written key. The path of the error if no such key was written.
+    """
+    path = error.path
+    if not error.problem.startswith(_WRONG_VALUE):
+        return path
+    key, bracket, index = path.partition("[")
+    group, *names = key.split(".")
+    if (
+        group not in ("links", "sites")
+        or len(names) < 2
+        or _find_value(tables, key) is not None
+    ):
+        return path
+    common_key = ".".join(names[1:])
+    if group == "links":
+        common_key = f"link.{common_key}"
+    # An argument of a user's law stands in a table of its own, which the author need not write.
+    for written_key in (common_key, common_key.replace("control.settings.", "control.", 1)):
+        value = _find_value(tables, written_key)
+        if isinstance(value, list):
+            return f"{written_key}{bracket}{index}"
+        if isinstance(value, dict):
+            entry = index.removesuffix("]")
+            return f"{written_key}.{entry}" if entry else written_key
+        if value is not None:
+            return written_key
+    return path
+
+
+def nest_overrides(pairs: Sequence[Override]) -> TomlTable:
+    """Returns overrides as tables, for `find_written_path`.
+
+    Args:
+        pairs: Dotted keys and their values.
+    """
+    tables: TomlTable = {}
+    for key, value in pairs:
+        *parents, last = key.split(".")
+        table = tables
+        for name in parents:
+            inner = table.setdefault(name, {})
+            if not isinstance(inner, dict):
+                inner = table[name] = {}
+            table = inner
+        table[last] = value
+    return tables
 
 
 def split_assignment(text: str) -> Override | None:

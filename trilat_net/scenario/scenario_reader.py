@@ -22,7 +22,15 @@ import tomli_w
 from ..errors import ScenarioError, suggest_nearest
 from ..files import open_regular
 from ..own_code import allow_own_code, name_law_classes
-from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
+from .override import (
+    Override,
+    apply_overrides,
+    expand_overrides,
+    find_written_path,
+    nest_overrides,
+    parse_overrides,
+    split_entries,
+)
 from .resolve import SHIPPED_FOLDER, resolve_scenario
 from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
@@ -145,8 +153,10 @@ def _change_scenario(
     Raises:
         ScenarioError: An override is not valid.
     """
+    pairs: list[Override] = []
     try:
-        expanded = expand_overrides(scenario, parse_overrides(overrides))
+        pairs = parse_overrides(overrides)
+        expanded = expand_overrides(scenario, pairs)
         changed = scenario
         if overrides:
             changed = parse_scenario(scenario.text, scenario.name, expanded)
@@ -154,7 +164,8 @@ def _change_scenario(
         named_classes = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
         return allow_own_code(changed, named_classes, scenario)
     except ScenarioError as error:
-        raise ScenarioError(error.problem, path=error.path, source=scenario.name) from None
+        path = find_written_path(error, nest_overrides(pairs))
+        raise ScenarioError(error.problem, path=path, source=scenario.name) from None
 
 
 class ExperimentText(NamedTuple):
@@ -300,21 +311,25 @@ def parse_scenario(
     Raises:
         ScenarioError: The text is not a valid scenario. The error contains the path of the key.
     """
+    written: dict[str, Any] = {}
     with _PARSE_LOCK:
         try:
             _refuse_long_keys(text)
             tables = _parse_toml(text)
+            written = tables
             pairs, entry_pairs = split_entries(tables, parse_overrides(overrides))
             apply_overrides(tables, pairs)
             scenario = build_scenario(resolve_scenario(tables, folder))
             if entry_pairs:
                 # The vectors of these entries exist only in the resolved scenario.
+                written = nest_overrides(entry_pairs)
                 tables = tomllib.loads(scenario.text)
                 apply_overrides(tables, expand_overrides(scenario, entry_pairs))
                 scenario = build_scenario(resolve_scenario(tables, folder))
             return scenario
         except ScenarioError as error:
-            raise ScenarioError(error.problem, path=error.path, source=source) from None
+            path = find_written_path(error, written)
+            raise ScenarioError(error.problem, path=path, source=source) from None
         except RecursionError:
             raise ScenarioError("is nested too deeply", source=source) from None
 

@@ -42,8 +42,9 @@ def live_command(
     """Runs a scenario live on a web page, where you lead the arms.
 
     A button on the page or Ctrl-C ends the session; then its log is verified and a report is
-    written. With --session, the page shows a session that is already running, and leaves it
-    running.
+    written. Whatever duration the scenario states, the session ends after an hour, unless
+    --duration or --set duration_s=S sets another duration. With --session, the page shows a
+    session that is already running, and leaves it running.
 
     Options:
         session: Show this running session instead of starting one.

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from trilat_studies.sweep import plan_sweep
+from trilat_studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_studies.tuning.search_space import (
     build_model_information,
     build_user_search_space,
@@ -24,6 +25,20 @@ TABLES: dict[str, Any] = {
     "sites": {"m": {"role": "master", "q0_rad": [0.3, 0.1]}, "s": {"role": "slave"}},
     "dominance": {"m": {"s": 1.0}, "s": {"m": 1.0}},
 }
+
+
+def test_fixed_gains_include_defaults_of_own_laws() -> None:
+    """Gains that neither the scenario nor an axis states are those of `__init__`, also inherited."""
+    for law in (PD, CompiledPD):
+        plan = plan_sweep(TABLES, over=["control.K=10,20"], laws=[law])
+        assert describe_fixed_gains(plan) == [f"tests.own_laws:{law.__name__}: d 3, gravity 1"]
+    stated = load_own_gains({"law": PD, "gravity": 0.5})
+    assert stated == ["tests.own_laws:PD: K 10, d 3, gravity 0.5"]
+
+
+def load_own_gains(control: dict[str, Any]) -> list[str]:
+    plan = plan_sweep({**TABLES, "control": control}, over=["link.delay_ms=10,20"])
+    return describe_fixed_gains(plan)
 
 
 def test_studies_take_tables_or_a_scenario() -> None:

@@ -35,6 +35,8 @@ MOST_METRICS = 10
 """Largest number of metrics in the short text."""
 _ROUNDING_KEYS = ("unaccounted_j",)
 """Keys of metrics that consist of rounding errors."""
+_UNDELAYED_KEYS = ("undelayed_max_rad", "undelayed_max_m")
+"""Keys of the largest distance from where the peers are at the same time."""
 _SUBJECTS = {
     "max": "largest of {}s",
     "sum": "sum of {}s",
@@ -148,6 +150,11 @@ class LogComparison(Result):
     means: Sequence[MeanInterval | None]
     remarks: dict[str, list[str]]
 
+    @property
+    def links_differ(self) -> bool:
+        """True if the scenarios differ in the settings of a link, such as its delay."""
+        return any(difference.concerns_link for difference in self.differences)
+
     def headline(self) -> str:
         """Returns a sentence that names the compared logs and the number of quantities.
 
@@ -188,7 +195,8 @@ class LogComparison(Result):
             for line in lines:
                 yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
 
-        rows = _select_most_different(self.metrics.rows)
+        shown_keys = _UNDELAYED_KEYS if self.links_differ else ()
+        rows = _select_most_different(self.metrics.rows, shown_keys)
         if rows:
             chosen = set(rows)
             means = [
@@ -221,6 +229,26 @@ class LogComparison(Result):
         else:
             yield "the same experiment"
 
+    def _describe_undelayed_errors(self) -> str:
+        """Returns a phrase with the largest distance from where the peers are, for each run.
+
+        The ordinary errors compare a site with what it has received of its peers, so that a
+        longer delay hardly shows in them.
+        """
+        texts = []
+        for row in self.metrics.rows:
+            if row.quantity.key not in _UNDELAYED_KEYS:
+                continue
+            for name, value in zip(self.metrics.columns, row.values, strict=True):
+                texts.append(f"{format_number(value, 3)} {row.quantity.unit} in {name}")
+        if not texts:
+            return ""
+        return (
+            f"; with the delay included, a site is at most {join_words(texts)} from where its "
+            "peers are at the same time, which e does not show: e compares with what the site "
+            "had received of them"
+        )
+
     def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
         """Returns the judgements and the largest difference of the runs in one sentence.
 
@@ -236,9 +264,10 @@ class LogComparison(Result):
         most = max(rows, key=lambda row: _measure_difference(row.values))
         values = [format_number(value, 4) for value in most.values]
         unit = f" {most.quantity.unit}" if most.quantity.unit else ""
-        return (
-            f"{text}; the largest difference: {most.quantity.name}, {join_words(values)}{unit}"
-        )
+        text += f"; the largest difference: {most.quantity.name}, {join_words(values)}{unit}"
+        if self.links_differ:
+            text += self._describe_undelayed_errors()
+        return text
 
     def _explain_missing_values(self) -> Iterator[str]:
         """Yields a sentence for each metric that applies to a log but has no value there.
@@ -347,20 +376,29 @@ def _measure_difference(values: Sequence[float | None]) -> float:
     return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
 
 
-def _select_most_different(rows: Sequence[_ComparisonRow]) -> list[_ComparisonRow]:
+def _select_most_different(
+    rows: Sequence[_ComparisonRow], shown_keys: Sequence[str] = ()
+) -> list[_ComparisonRow]:
     """Returns the metrics that differ most between runs, in their order.
 
     Errors of the computation, which are rounding of different size in every run, are left out.
 
     Args:
         rows: The metrics of the runs.
+        shown_keys: Keys of metrics that are included even if they differ little.
     """
     differences = {}
     for index, row in enumerate(rows):
         difference = _measure_difference(row.values)
-        if difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS:
+        is_notable = difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS
+        if is_notable or row.quantity.key in shown_keys:
             differences[index] = difference
-    ranked = sorted(differences, key=lambda index: (-differences[index], index))
+
+    def rank(index: int) -> tuple[bool, float, int]:
+        """Returns the place of a row: those of `shown_keys` first, then by difference."""
+        return rows[index].quantity.key not in shown_keys, -differences[index], index
+
+    ranked = sorted(differences, key=rank)
     return [rows[index] for index in sorted(ranked[:MOST_METRICS])]
 
 

@@ -306,7 +306,7 @@ def compare_command(
     """Compares logs, or tuned control laws, side by side.
 
     For logs, the command shows the settings that differ, the verdicts, and the ten metrics that
-    differ most; with --all it shows every metric. All control laws are tuned by
+    differ most; with --all it shows every metric. With --tune, all control laws are tuned by
     the same procedure. Whether a tuned law is stable is judged from the motion in the second
     half of its runs alone; `trilat certify` also uses twins and roots. The results are not
     ranked, because small errors can also mean that an arm hangs freely, or that no operator

@@ -17,15 +17,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, run_in_own_folder, show_progress, value
+from trilat_net.app import flag, options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
 from trilat_net.presentation import terminal_output as terminal
 
 from .study_commands import parse_seeds
 
 if TYPE_CHECKING:
-    from trilat_net.scenario import Scenario
-
     from .sweep import FinishedSweep
     from .sweep.margin_search import SearchRange
     from .sweep.sweep_plan import SweepPlan
@@ -46,9 +44,7 @@ def _check_modes(used_options: Sequence[str]) -> None:
         UsageError: Two options exclude each other, or an option lacks the option to which it
             belongs.
     """
-    modes = [
-        name for name in ("--map", "--margin", "--confirm", "--cell") if name in used_options
-    ]
+    modes = [name for name in ("--map", "--margin", "--cell") if name in used_options]
     if len(modes) > 1:
         raise UsageError(f"{' and '.join(modes)} cannot be combined: give only one of them")
     if "--width" in used_options and "--map" not in used_options:
@@ -140,48 +136,6 @@ def _search_margins(
         terminal.out.print()
     terminal.print_result(margins, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
-
-
-def _confirm_cells(results: "SweepResults", count: int) -> None:
-    """Runs cells next to the edges live, and compares their verdicts with the sweep.
-
-    Args:
-        results: The finished sweep.
-        count: Number of cells on each side of the edges.
-
-    Raises:
-        typer.Exit: A verdict differs.
-    """
-    from .sweep.live_confirmation import (
-        choose_cells_near_edges,
-        confirm_cell,
-        tabulate_confirmations,
-    )
-
-    keys = [axis.key for axis in results.plan.axes]
-    rows = choose_cells_near_edges(results.rows, keys, count)
-    name = f"confirm-{results.plan.base.name}"
-
-    def run_live(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
-        """Runs one point of a parameter study in real time, with one process per robot arm.
-
-        Args:
-            scenario: Scenario with the parameters of this point.
-            cell: Name of the point, which is part of the name of its folder.
-
-        Returns:
-            The path of the log, and a sentence for each problem of the run.
-        """
-        outcome = run_in_own_folder(scenario, cell, f"{name}-{cell}")
-        return outcome.log, outcome.problems
-
-    confirmations = [confirm_cell(row, run_live) for row in rows]
-    terminal.out.print()
-    terminal.print_table(tabulate_confirmations(confirmations, keys))
-    same_count = sum(confirmation.same for confirmation in confirmations)
-    terminal.out.print(f"{same_count} of {len(confirmations)} verdicts are the same")
-    if same_count < len(confirmations):
-        raise typer.Exit(1)
 
 
 def _run_sweep(
@@ -343,7 +297,7 @@ def sweep_command(
     width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
     margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
     tolerance: Annotated[float, _option("--tolerance", metavar="SHARE")] = 0.005,
-    confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
+    confirm: Annotated[int | None, typer.Option("--confirm", hidden=True)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Maps where a scenario is stable, over a grid of settings.
@@ -373,13 +327,17 @@ def sweep_command(
             scenario key, at every point of the grid.
         tolerance: Largest uncertainty of a stability limit that --margin finds, relative to its
             value.
-        confirm: For an earlier sweep: run up to this many cells on each side of the stability
-            limit as live sessions.
+        confirm: Former option that ran cells live. Its error names the replacement.
     """
     from .sweep import plan_sweep
     from .sweep.margin_search import format_range_axis, parse_search_range
 
     used_options = options.list_used_options(context)
+    if confirm is not None:
+        raise UsageError(
+            "there is no --confirm any more: trilat sweep FOLDER --cell N prints the command "
+            "of a cell, which runs live with trilat live in place of trilat sim"
+        )
     _check_modes(used_options)
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     draw = partial(_draw_map, width=width, jobs=jobs, on=on)
@@ -387,10 +345,6 @@ def sweep_command(
     uses_finished_sweep = cell is not None or resume is not None or results is not None
     if uses_finished_sweep:
         _refuse_plan_options(used_options)
-    elif confirm is not None:
-        raise UsageError(
-            "--confirm needs the results of a sweep: use trilat sweep FOLDER --confirm 5"
-        )
 
     if resume is not None:
         if scenario is not None or cell is not None:
@@ -407,7 +361,7 @@ def sweep_command(
             )
         return _print_cell_commands(Path(scenario), cell, as_json=as_json)
     elif results is not None:
-        return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
+        return _show_results(results, draw if mapped else None, as_json=as_json)
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError(
             "name a scenario and the keys to sweep, as in: --over link.delay_ms=0:1600:50"
@@ -445,16 +399,14 @@ def sweep_command(
 
 def _show_results(
     path: Path,
-    confirm: int | None,
     draw: "Callable[[SweepResults, Path], None] | None",
     *,
     as_json: bool,
 ) -> None:
-    """Confirms cells of a finished sweep, draws its map, or prints its summary.
+    """Draws the map of a finished sweep, or prints its summary.
 
     Args:
         path: Folder of the sweep, or its table of results.
-        confirm: Number of cells on each side of the edges to run live. None runs no cell.
         draw: Function that draws the map. None draws no map.
         as_json: True to print the results as JSON in addition.
     """
@@ -462,9 +414,7 @@ def _show_results(
 
     results = read_results(path)
     with terminal.lines_aside(as_json):
-        if confirm is not None:
-            _confirm_cells(results, confirm)
-        elif draw is not None:
+        if draw is not None:
             draw(results, path if path.is_dir() else path.parent)
         else:
             terminal.print_texts(describe_sweep_plan(results.plan))

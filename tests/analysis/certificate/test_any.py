@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
-from trilat_net.analysis.certificate.stability_certificate import (
-    FALSE_RECORDS_TEXT,
-    certify,
-)
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.errors import ScenarioError
 from trilat_net.presentation.certificate_text import describe_certificate, list_energies
+from trilat_net.presentation.verdict_text import FALSE_RECORDS_TEXT
 from trilat_net.scenario import load_scenario
 
 SCENARIOS = (

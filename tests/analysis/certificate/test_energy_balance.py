@@ -26,13 +26,10 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.certificate.premises import explain_no_functional
-from trilat_net.analysis.certificate.stability_certificate import (
-    Certificate,
-    StabilityFinding,
-    certify,
-)
+from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from trilat_net.presentation.premise_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
 
 from . import runs

@@ -4,18 +4,28 @@ Walls that are held over a tick: their energy, the damping that dissipates this 
 premise by its name.
 """
 
+import ast
+import inspect
 from collections.abc import Iterator, Mapping
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import get_args
 
 import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis.certificate import premise_text
-from trilat_net.analysis.certificate.premise_quantities import AbsentSpan, PremiseQuantities
-from trilat_net.analysis.certificate.premises import (
+from trilat_net.analysis.certificate import (
+    premise_quantities,
+    stability_certificate,
+    verdict_facts,
+)
+from trilat_net.analysis.certificate import premises as premises_module
+from trilat_net.analysis.certificate.premise_quantities import (
+    AbsentSpan,
     Premise,
+    PremiseQuantities,
+)
+from trilat_net.analysis.certificate.premises import (
     check_premises,
     find_absent_spans,
     gather_facts,
@@ -23,6 +33,8 @@ from trilat_net.analysis.certificate.premises import (
 from trilat_net.analysis.torque_sources import find_wall_energies
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
+from trilat_net.presentation import premise_text, verdict_text
+from trilat_net.presentation.verdict_text import REQUIREMENTS
 from trilat_net.scenario import load_scenario
 
 from . import runs
@@ -110,6 +122,54 @@ def strings_in(value: object) -> Iterator[str]:
 
 def test_each_kind_of_quantities_has_its_sentence() -> None:
     assert set(premise_text.DESCRIBERS) == set(get_args(PremiseQuantities))
+
+
+def list_premise_names() -> set[str]:
+    """Returns the names of all premises of the theorem that the source creates."""
+    tree = ast.parse(inspect.getsource(premises_module))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    created = [call for call in calls if getattr(call.func, "id", "") == "Premise"]
+    return {call.args[0].value for call in created if isinstance(call.args[0], ast.Constant)}
+
+
+def test_each_premise_that_fails_is_explained() -> None:
+    """A name alone says nothing to a newcomer; missing records leave a premise undecided."""
+    assert list_premise_names() - {"records"} == set(REQUIREMENTS)
+
+
+def list_clauses(module: ModuleType) -> set[str]:
+    """Returns the strings of three or more words in a module that are no docstrings."""
+    tree = ast.parse(inspect.getsource(module))
+    skipped = set()
+    for node in ast.walk(tree):
+        is_hook = isinstance(node, ast.Call) and getattr(node.func, "id", "") == "find_hook"
+        if is_hook or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
+            skipped.update(id(child) for child in ast.walk(node))
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and id(node) not in skipped
+        and len(node.value.split()) > 2
+    }
+
+
+@pytest.mark.parametrize("module", [premises_module, premise_quantities, verdict_facts])
+def test_premises_and_facts_have_no_sentence(module: ModuleType) -> None:
+    """The analysis finds names and numbers, of which the presentation makes sentences."""
+    assert list_clauses(module) == set()
+    assert len(list_clauses(premise_text)) > 20
+
+
+def test_certificates_have_no_sentence_of_their_own() -> None:
+    """The name of a source of energy is a key of the JSON output."""
+    assert list_clauses(stability_certificate) == {"what beta does not cancel"}
+
+
+def test_each_kind_of_facts_has_its_sentence() -> None:
+    assert set(verdict_text.DESCRIBERS) == set(get_args(verdict_facts.VerdictFacts))
+    assert set(verdict_text.RECORD_GAPS) == set(verdict_facts.RecordGap)
 
 
 def test_unequal_scalars_of_kd_pass() -> None:

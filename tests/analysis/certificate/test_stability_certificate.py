@@ -8,15 +8,13 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.analysis.certificate.premises import (
-    NO_COMMON_TIME,
-    NO_PERIOD,
-    find_unjudged_spans,
-)
-from trilat_net.analysis.certificate.stability_certificate import StabilityFinding, certify
+from trilat_net.analysis.certificate.premises import find_unjudged_spans
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.verdict_facts import RecordGap, StabilityFinding
 from trilat_net.analysis.run_end import EndBehaviour
 from trilat_net.errors import LogError
 from trilat_net.log.log_reader import Log
+from trilat_net.presentation.verdict_text import RECORD_GAPS
 from trilat_net.scenario import load_scenario
 
 from . import runs
@@ -94,7 +92,7 @@ def test_external_arms_are_judged_with_identified_theta() -> None:
 
 def test_a_record_without_neighbours_is_no_period() -> None:
     certificate = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
-    assert certificate.verdict.text == f"V cannot be judged: {NO_PERIOD}"
+    assert certificate.verdict.text == f"V cannot be judged: {RECORD_GAPS[RecordGap.NO_PERIOD]}"
 
 
 def test_a_period_too_long_is_not_judged() -> None:
@@ -158,7 +156,10 @@ def test_nearly_empty_logs_are_reported(ticks: int) -> None:
     certificate = certify(
         logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks)
     )
-    assert certificate.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
+    assert (
+        certificate.verdict.text
+        == f"V cannot be judged: {RECORD_GAPS[RecordGap.NO_COMMON_TIME]}"
+    )
     assert certificate.end.behaviour is EndBehaviour.UNDECIDED
     assert not certificate.passed
 

@@ -17,14 +17,15 @@ from tests.log_editing import edited, opened, recorded, without
 from tests.log_surgery import taken_apart
 from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
-    StabilityFinding,
     certify,
-    describe_unsupplied_growth,
+    find_unsupplied_growth,
 )
+from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
+from trilat_net.presentation.verdict_text import describe_growth
 from trilat_net.scenario import parse_scenario
 
 from . import runs
@@ -61,7 +62,8 @@ def test_outside_the_theorem_without_a_rise() -> None:
     certificate = runs.run("wall").certificate
     assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert certificate.verdict.text.startswith(
-        "the theorem does not apply (premises that fail: hands); V rose by no more than the"
+        "the theorem does not apply (premises that fail: hands must add no energy); V rose by "
+        "no more than the"
     )
     assert certificate.bounded_by_v
 
@@ -267,7 +269,7 @@ def test_v_that_rises_at_the_end_is_named() -> None:
         changed = replace(
             balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
         )
-        return describe_unsupplied_growth(changed, 1e-3)
+        return [describe_growth(one) for one in find_unsupplied_growth(changed, 1e-3)]
 
     assert growth(np.zeros(len(V))) == []
     assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []

@@ -9,6 +9,8 @@ from tests.analysis.logs import rewritten, simulated
 from trilat_net.analysis.aligned import align_records, find_latest_rows
 from trilat_net.analysis.dominance_history import trace_dominance
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
+from trilat_net.analysis.run_view import RunView
 
 from .written import pair
 
@@ -93,6 +95,21 @@ def test_undelayed_error_weighs_peers_by_dominance() -> None:
     error = np.abs(log["s"].q - mean)
     assert np.ptp(alpha) != 0.0
     assert sites["s"]["undelayed_max_rad"].value == pytest.approx(error.max(), rel=1e-12)
+
+
+def test_undelayed_error_keeps_to_common_times() -> None:
+    """If q_s = q_m - t for 2 s, the error over the times of a run of 1 s is the one at 1 s."""
+
+    def motion(site: str, t_s: float) -> dict[str, list[float]]:
+        return {"q": [-t_s if site == "s" else 0.0, 0.0]}
+
+    short = RunView(pair(motion, seconds=1.0))
+    long = RunView(pair(motion, seconds=2.0))
+    end_s = short.sites["s"].records.t_s[-1]
+    for view, other, error_rad in ((long, short, end_s), (short, long, end_s)):
+        metrics = measure_undelayed_error(view, "s", other)
+        assert metrics["undelayed_max_rad"].value == pytest.approx(error_rad)
+    assert measure_undelayed_error(long, "s")["undelayed_max_rad"].value > 1.9
 
 
 def test_following_uses_the_delay_in_use() -> None:

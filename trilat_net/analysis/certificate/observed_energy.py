@@ -30,8 +30,12 @@ from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
-from .premise_quantities import BookedTorqueQuantities, BooksQuantities, SamplingQuantities
-from .premises import Premise
+from .premise_quantities import (
+    BookedTorqueQuantities,
+    BooksQuantities,
+    Premise,
+    SamplingQuantities,
+)
 
 LEAST_ENERGY_J = -1e-9
 """Rounding error of an energy that is zero, in J. It is negative, as lower bounds use it."""

@@ -2,7 +2,7 @@
 
 A site is the process that runs one arm, and the sites follow each other. A condition of the
 theorem is called a premise. `premises` and `observed_energy` compute the quantities from the
-log of a run. `premise_text` writes the sentences about them.
+log of a run. The package `presentation` writes the sentences about them.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.
@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from enum import Enum, auto
 from typing import NamedTuple
 
+from ...hooks import find_hook
+from ...results import JsonObject
 from ..dominance_history import PeerLoss
 from ..torque_sources import WallEnergy
 
@@ -449,3 +451,34 @@ PremiseQuantities = (
     | SamplingQuantities
 )
 """The quantities of any premise."""
+
+
+class Premise(NamedTuple):
+    """A condition of the stability theorem, and whether a run meets it.
+
+    Attributes:
+        name: Key of the premise, as in "delays".
+        holds: True if the run meets the condition, False if not, None if the log does not show
+            it.
+        quantities: What the log shows about the condition.
+    """
+
+    name: str
+    holds: bool | None
+    quantities: PremiseQuantities
+
+    @property
+    def text(self) -> str:
+        """What the log shows about the premise, as a sentence for people.
+
+        The package `presentation` composes it from the quantities.
+        """
+        return str(find_hook("describe a premise")(self.quantities))
+
+    def to_json(self) -> JsonObject:
+        """Returns the premise as a row of `trilat certify --json`.
+
+        For example {"name": "torque", "holds": True, "text": ...}, where the text states the
+        evidence.
+        """
+        return {"name": self.name, "holds": self.holds, "text": self.text}

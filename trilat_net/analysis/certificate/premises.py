@@ -16,20 +16,19 @@ The module also collects how many records were available.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      it. `premise_text` writes the sentences about them.
+      it. The module has no sentences: the package `presentation` writes them.
     - Missing information never makes a run stable. The judgement stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some sites.
     - A log that was changed after it was written does not pass.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ...log import Coverage, Integrity, Log, judge_integrity
+from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
-from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited_rows
 from ..dominance_history import (
@@ -67,7 +66,7 @@ from .premise_quantities import (
     OperatorQuantities,
     ParameterFault,
     ParameterQuantities,
-    PremiseQuantities,
+    Premise,
     PresenceQuantities,
     PresentStretch,
     RecordQuantities,
@@ -78,7 +77,7 @@ from .premise_quantities import (
     TouchedStop,
     WallQuantities,
 )
-from .premise_text import DESCRIBERS, describe_missing_functionals
+from .verdict_facts import Evidence, NoFunctional, RecordGap
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages of samples that differ by less than this count as equal, in s.
@@ -105,42 +104,8 @@ LEAST_SPEED_M_S = 1e-9
 Slower speeds are the rounding error of an axis along which the end effector cannot move.
 """
 
-NO_COMMON_TIME = "there is no time at which every site has records"
-NO_PERIOD = "there is no period whose records are complete"
 
-
-class Premise(NamedTuple):
-    """A condition of the stability theorem, and whether a run meets it.
-
-    Attributes:
-        name: Key of the premise, as in "delays".
-        holds: True if the run meets the condition, False if not, None if the log does not show
-            it.
-        quantities: What the log shows about the condition.
-    """
-
-    name: str
-    holds: bool | None
-    quantities: PremiseQuantities
-
-    @property
-    def text(self) -> str:
-        """What the log shows about the premise, as a sentence for people.
-
-        `premise_text` has a function for each class of quantities that composes this sentence.
-        """
-        return DESCRIBERS[type(self.quantities)](self.quantities)
-
-    def to_json(self) -> JsonObject:
-        """Returns the premise as a row of `trilat certify --json`.
-
-        For example {"name": "torque", "holds": True, "text": ...}, where the text states the
-        evidence.
-        """
-        return {"name": self.name, "holds": self.holds, "text": self.text}
-
-
-def _find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
+def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
     """Finds the arms for which the energy function of the stability proof does not exist.
 
     The energy exists only for certain control laws. It requires the true dynamic parameters of
@@ -170,21 +135,6 @@ def _find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
         MissingFunctional(obstacle, law, tuple(sites))
         for (obstacle, law), sites in sites_by_reason.items()
     ]
-
-
-def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function V of the stability proof does not exist.
-
-    A certificate then judges the run without V.
-
-    Args:
-        scenario: The description of the experiment.
-
-    Returns:
-        The names of these arms' sites and the reasons, separated by semicolons. Empty if the
-        energy exists for every arm.
-    """
-    return describe_missing_functionals(_find_missing_functionals(scenario))
 
 
 class FunctionalFacts(NamedTuple):
@@ -224,13 +174,13 @@ class _RunFacts(NamedTuple):
         constants: Gains and limits of every site, the process that runs one arm, by name. Empty
             if V does not exist for some site.
         functional: V over time, and what changed it. None if V cannot be computed.
-        unknown: The reason why V cannot be computed. Empty if it can.
+        unknown: The reason why V cannot be computed. None if it can.
     """
 
     log: Log
     constants: dict[str, SiteConstants]
     functional: FunctionalFacts | None = None
-    unknown: str = ""
+    unknown: NoFunctional | RecordGap | None = None
 
 
 def gather_facts(log: Log) -> _RunFacts:
@@ -247,18 +197,18 @@ def gather_facts(log: Log) -> _RunFacts:
         LogError: A recorded change of the settings, such as of a dominance factor, is not
             valid.
     """
-    lacking = explain_no_functional(log.scenario)
-    if lacking:
-        return _RunFacts(log, {}, unknown=lacking)
+    missing = find_missing_functionals(log.scenario)
+    if missing:
+        return _RunFacts(log, {}, unknown=NoFunctional(tuple(missing)))
 
     constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
     energies = compute_site_energies(log)
     if not energies:
-        return _RunFacts(log, constants, unknown=NO_COMMON_TIME)
+        return _RunFacts(log, constants, unknown=RecordGap.NO_COMMON_TIME)
     balance = compute_energy_balance(energies)
     absent = find_absent_spans(log)
     if not balance.judged.any():
-        return _RunFacts(log, constants, unknown=NO_PERIOD)
+        return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
 
     closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
     ambiguous = next((groups for groups in closed_groups if len(groups) > 1), ())
@@ -294,7 +244,7 @@ def check_premises(run: _RunFacts) -> list[Premise]:
     Returns:
         The premises that concern this run, in the order in which a certificate lists them.
     """
-    missing = _find_missing_functionals(run.log.scenario)
+    missing = find_missing_functionals(run.log.scenario)
     law = Premise("law", bool(run.constants), LawQuantities(tuple(missing)))
     premises: list[Premise | None] = [law]
 
@@ -757,75 +707,6 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
     starts_s = times[::2].tolist()
     ends_s = times[1::2].tolist()
     return list(zip(starts_s, ends_s, strict=True))
-
-
-class Evidence(NamedTuple):
-    """The records on which a stability certificate is based, and whether they suffice.
-
-    A site is the process that runs one arm, and stores a record in every tick of its control
-    loop.
-
-    Attributes:
-        coverage: Recorded ticks and expected ticks of every site.
-        functional_share: Fraction of the tick periods in which the energy of the stability
-            proof is known from records. Periods in which a site was absent do not count. None
-            if this energy is not judged.
-        min_coverage: Least fraction that suffices, for the ticks and for the periods.
-        integrity: Whether the log is unchanged since it was written.
-        unmet: Sites that did not react to the other sites, because their motion was copied from
-            an earlier run when the run was repeated.
-    """
-
-    coverage: Coverage
-    functional_share: float | None
-    min_coverage: float
-    integrity: Integrity
-    unmet: tuple[str, ...] = ()
-
-    @property
-    def reasons(self) -> list[str]:
-        """Sentences that say why the records do not suffice to judge the run.
-
-        Examples are a log that was changed after the run, or too many missing records. A run
-        with such a reason is not called stable. Empty if the records suffice.
-        """
-        least = self.min_coverage
-        reasons = []
-        if not self.integrity.passed:
-            reasons.append(f"the log is not as it was made: {self.integrity.text}")
-        if self.coverage.share < least:
-            reasons.append(f"records are missing: {self.coverage.describe(least)}")
-        share = self.functional_share
-        if share is not None and share < least:
-            reasons.append(f"V is judged over {100.0 * share:.4g} % of its periods")
-        if self.unmet:
-            sites = " and ".join(self.unmet)
-            reasons.append(f"{sites}, as recorded, did not react to this run")
-        return reasons
-
-    @property
-    def text(self) -> str:
-        """A sentence for the user: how many records exist, and whether the log is unchanged.
-
-        The certificate prints this sentence for every run, also if the records suffice.
-        """
-        return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns the extent and authenticity of the records as plain values.
-
-        The keys are those of `trilat certify --json`. For example, "coverage" is the smallest
-        share of a site's ticks that have a record, from 0 to 1, and "integrity" states whether
-        the log is unchanged.
-        """
-        return {
-            "coverage": self.coverage.share,
-            "functional_coverage": self.functional_share,
-            "min_coverage": self.min_coverage,
-            "judged": self.coverage.to_json(),
-            "integrity": self.integrity.state.name.lower(),
-            "open_loop_sites": list(self.unmet),
-        }
 
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core import Array, CoreChange
+from ...hooks import find_hook
 from ...net import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
@@ -43,8 +44,7 @@ from .energy_balance import (
     find_common_times,
     find_dominance_matrices,
 )
-from .premise_text import describe_closed_groups
-from .premises import explain_no_functional
+from .premises import find_missing_functionals
 
 STEP_S = 0.25
 """Shortest span of time over which V is computed in one call, in s."""
@@ -270,7 +270,10 @@ class RunningEnergy:
     """
 
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
-        self.reason = explain_no_functional(scenario)
+        self.reason = ""
+        missing = find_missing_functionals(scenario)
+        if missing:
+            self.reason = str(find_hook("describe missing functionals")(missing))
         rules = [spec.on_stale.rule for spec in scenario.sites.values()]
         degrades = any(rule.degrades for rule in rules)
         if degrades and not self.reason:
@@ -357,7 +360,7 @@ class RunningEnergy:
             if len(groups) > 1:
                 sites = list(energies)
                 names = [[sites[n] for n in group] for group in groups[:2]]
-                self.reason = describe_closed_groups(names)
+                self.reason = str(find_hook("describe closed groups")(names))
                 return None
 
         is_known = len(find_common_times(energies)) > 1

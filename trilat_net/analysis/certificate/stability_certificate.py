@@ -22,14 +22,13 @@ Invariant:
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
 from ...core import Array
+from ...hooks import find_hook
 from ...log import MIN_COVERAGE, Log
 from ...results import JsonObject, Result, finite_or_none
 from ..run_end import EndBehaviour, RunEnd, Stability
@@ -45,15 +44,25 @@ from .energy_balance import (
     rise_above_minimum,
 )
 from .observed_energy import ObservedEnergy, ObservedFinding
-from .premise_text import describe_closed_groups
+from .premise_quantities import Premise
 from .premises import (
-    Evidence,
     FunctionalFacts,
-    Premise,
     check_premises,
     collect_evidence,
     find_unjudged_spans,
     gather_facts,
+)
+from .verdict_facts import (
+    AmbiguousWeights,
+    CoarseEnergies,
+    Evidence,
+    FunctionalCourse,
+    FunctionalRise,
+    StabilityFinding,
+    StabilityVerdict,
+    UnclosedBalance,
+    UnsuppliedGrowth,
+    WrongTorque,
 )
 
 BROKEN_BALANCE_SHARE = 2e-4
@@ -73,64 +82,7 @@ COARSE_TOLERANCE_SHARE = 1e-2
 NOTABLE_CAUSE_SHARE = 0.05
 """Least share of a rise of V that a source must supply to be named as a cause."""
 
-FALSE_RECORDS_TEXT = "these records were not made by the equations that the log claims"
-_PERIOD_OR_FALSE = (
-    f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; "
-    "`trilat verify` tells which"
-)
-
 _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
-
-
-class StabilityFinding(StrEnum):
-    """What the energy function V of the stability proof shows about a run.
-
-    COVERED means that all premises of the theorem hold, so that it proves the run stable.
-    BROKEN means that the records contradict each other, and ROSE that V rose without a supply
-    of energy. The value of each member is the text for people.
-    """
-
-    COVERED = "covered by the theorem"
-    DID_NOT_RISE = "the theorem does not apply, and V did not rise"
-    ROSE = "V rose"
-    BROKEN = "the energy balance is broken"
-    NOT_JUDGED = "V cannot be judged"
-
-
-class _FunctionalRise(NamedTuple):
-    """The largest rise of the arms' total energy that nobody supplied from outside.
-
-    The energy is the function V of the stability proof, less the work of operators and
-    environments. It must not rise by itself.
-
-    Attributes:
-        from_s: Time of the minimum of V before the rise, in s.
-        at_s: Time of the highest V, in s.
-        amount: Size of the rise, in J.
-        causes: Energy that each source supplied during the rise, in J, largest first. Only
-            sources of more than 5 % of the rise are listed.
-    """
-
-    from_s: float
-    at_s: float
-    amount: float
-    causes: dict[str, float]
-
-
-class _StabilityVerdict(NamedTuple):
-    """What the energy function V of the stability proof shows about a run.
-
-    Attributes:
-        finding: The finding, such as that V never rose.
-        text: The finding as a sentence.
-        rise: The largest rise of V beyond the tolerance. None if V did not rise.
-        tolerance: Size that a rise must exceed to count, in J.
-    """
-
-    finding: StabilityFinding
-    text: str
-    rise: _FunctionalRise | None = None
-    tolerance: float = 0.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -161,7 +113,7 @@ class Certificate(Result):
     """
 
     premises: list[Premise]
-    verdict: _StabilityVerdict
+    verdict: StabilityVerdict
     end: RunEnd
     evidence: Evidence
     balance: EnergyBalance | None = None
@@ -186,7 +138,7 @@ class Certificate(Result):
         return laws != [False]
 
     @property
-    def paper_weights_rise(self) -> _FunctionalRise | None:
+    def paper_weights_rise(self) -> FunctionalRise | None:
         """The largest rise that the total energy would have if all arms had the same weight.
 
         The paper on which the control law is based uses such equal weights in the energy
@@ -225,8 +177,9 @@ class Certificate(Result):
         covered = self.verdict.finding is StabilityFinding.COVERED
         all_hold = all(premise.holds is True for premise in self.premises)
         is_proof = covered and all_hold and self.has_lasting_delays
-        theorem = ("the theorem, all of whose premises hold",) if is_proof else ()
-        return (*theorem, *self.law_proofs)
+        if not is_proof:
+            return self.law_proofs
+        return (str(find_hook("name the theorem")()), *self.law_proofs)
 
     @property
     def _doubts(self) -> tuple[str, ...]:
@@ -239,7 +192,8 @@ class Certificate(Result):
         if self.verdict.finding is StabilityFinding.BROKEN:
             doubts.append(self.verdict.text)
         elif self.balance is not None:
-            doubts += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
+            growths = find_unsupplied_growth(self.balance, self.verdict.tolerance)
+            doubts += [str(find_hook("describe a growth of V")(growth)) for growth in growths]
         if self.observed is not None and self.observed.finding in _REFUTING_FINDINGS:
             doubts.append(self.observed.text)
         return (*doubts, *self.evidence.reasons)
@@ -291,21 +245,10 @@ class Certificate(Result):
     def headline(self) -> str:
         """Returns the judgement and its basis in one line for people.
 
-        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". If the arms
-        exceeded their limits, the line says which joint did so, and when.
+        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". The line is
+        composed by the package `presentation`.
         """
-        if self.end.behaviour is EndBehaviour.DIVERGED:
-            return f"{self.stability}: {self.end.text}"
-        phrase = self.end.phrase
-        # A proof may show a run to be stable whose end alone would be judged otherwise.
-        is_good = self.stability in (Stability.STABLE, Stability.SETTLED)
-        if is_good and self.end.stability is not Stability.SETTLED:
-            phrase = f"{phrase} at the end of the record"
-            if self.end.behaviour is EndBehaviour.UNDECIDED:
-                phrase = "the end of the record shows no trend yet"
-        text = f"{self.stability}: {phrase}"
-        rests_on = self.decision.rests_on
-        return f"{text}; rests on: {rests_on}" if rests_on else text
+        return str(find_hook("head a certificate")(self))
 
     def to_dict(self) -> JsonObject:
         """Returns the certificate as plain values, with the keys of `trilat certify --json`.
@@ -359,7 +302,7 @@ class Certificate(Result):
         A run with a broken energy balance or a changed log is never accepted.
 
         Args:
-            accepted: Further judgements to accept: "settled" for a run that came to rest and
+            accepted: Further judgements to accept: "settled" for a run that slowed down and
                 whose pushes all died away, "bounded" for a bounded oscillation, "open" for a
                 run that cannot be decided.
         """
@@ -402,14 +345,14 @@ def certify(
     facts = run.functional
     premises = check_premises(run)
 
-    verdict = _StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
     if facts is not None:
         verdicts = (judge(facts, premises) for judge in JUDGEMENTS)
         verdict = next(verdict for verdict in verdicts if verdict is not None)
         if not facts.groups:
             verdict = verdict._replace(tolerance=facts.tolerance)
-    if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
-        verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
+    else:
+        assert run.unknown is not None
+        verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
 
     certificate = Certificate(
         premises=premises,
@@ -434,9 +377,7 @@ def certify(
     )
 
 
-def _judge_site_balances(
-    run: FunctionalFacts, _: Sequence[Premise]
-) -> _StabilityVerdict | None:
+def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Returns a verdict if the energy balance of some site does not close.
 
     Each site is judged by itself. If energy appears or disappears without a source, the records
@@ -462,23 +403,23 @@ def _judge_site_balances(
         if involved.isdisjoint(external):
             simulated.append(site)
     site = max(simulated or wrong, key=error_j.__getitem__)
-    energy = energies[site]
-    exceeds = np.abs(energy.unexplained) > compute_bound_j(site)
-    from_s = energy.motion.records.t_s[int(np.argmax(exceeds))]
-    amount = f"{error_j[site]:.3g} J of {scale:.4g} J"
-    text = f"the energy of {site} does not add up from {from_s:.4g} s on, by {amount}"
-
-    if not simulated:
-        arms = f"the external arm of {', '.join(external)}"
-        text += f": {arms} does not move as its theta says, or somebody pushes it"
-        return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+    exceeds = np.abs(energies[site].unexplained) > compute_bound_j(site)
+    first_row = int(np.argmax(exceeds))
     is_clear = error_j[site] > compute_bound_j(site, CLEAR_BREAK_SHARE)
-    is_certain = is_clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
-    reason = FALSE_RECORDS_TEXT if is_certain else _PERIOD_OR_FALSE
-    return _StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {reason}")
+    is_known_well = energies[site].uncertainty < CLEAR_BREAK_SHARE * scale
+    facts = UnclosedBalance(
+        site=site,
+        from_s=float(energies[site].motion.records.t_s[first_row]),
+        error_j=error_j[site],
+        scale_j=scale,
+        external=() if simulated else tuple(external),
+        is_certain=bool(is_clear and is_known_well),
+    )
+    finding = StabilityFinding.BROKEN if simulated else StabilityFinding.NOT_JUDGED
+    return StabilityVerdict(finding, facts)
 
 
-def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerdict | None:
+def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Returns the verdict BROKEN if recorded torques differ from the control law, Eq. (13).
 
     The records are then false, so that nothing can be concluded from them. None if all agree.
@@ -489,75 +430,56 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerd
         largest_nm = np.abs(records.tau).max(axis=1)
         wrong = error_nm > TORQUE_TOLERANCE * (1.0 + largest_nm)
         if wrong.any():
-            from_s = records.t_s[int(np.argmax(wrong))]
-            text = (
-                f"the torque of {site} is not that of Eq. (13), by up to "
-                f"{error_nm.max():.3g} N m, from {from_s:.4g} s on: {FALSE_RECORDS_TEXT}"
+            facts = WrongTorque(
+                site=site,
+                from_s=float(records.t_s[int(np.argmax(wrong))]),
+                error_nm=float(error_nm.max()),
             )
-            return _StabilityVerdict(StabilityFinding.BROKEN, text)
+            return StabilityVerdict(StabilityFinding.BROKEN, facts)
     return None
 
 
-def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> _StabilityVerdict | None:
+def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Returns a verdict if V cannot be judged.
 
     This is the case if the weights beta of the sites in V are not unique, or if the energies
     are not known precisely enough to decide whether V rose.
     """
     if run.groups:
-        text = describe_closed_groups(run.groups)
-        return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+        return StabilityVerdict(StabilityFinding.NOT_JUDGED, AmbiguousWeights(run.groups))
     scale = run.balance.scale
     if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
-    text = (
-        "the period is too long for these gains, so its energies are known only to "
-        f"{run.tolerance:.3g} J of {scale:.4g} J"
-    )
-    return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+    return StabilityVerdict(StabilityFinding.NOT_JUDGED, CoarseEnergies(run.tolerance, scale))
 
 
-def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> _StabilityVerdict:
+def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
     """Returns the verdict of a run whose V can be judged.
 
     The verdict depends on whether V rose beyond the supplied energy, and on whether the
     premises of the theorem hold.
     """
     balance = run.balance
-    failed = [premise.name for premise in premises if premise.holds is False]
-    outside = f"the theorem does not apply (premises that fail: {', '.join(failed)})"
-    rise = _find_largest_rise(balance, run.tolerance)
-    if rise is not None:
-        context = outside
-        if not failed:
-            context = "though the premises of the theorem hold, which is one of continuous time"
-        largest_causes = list(rise.causes.items())[:4]
-        causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in largest_causes)
-        percent = 100.0 * rise.amount / balance.V.max()
-        text = (
-            f"{context}: V rose by {rise.amount:.3g} J ({percent:.3g} % of its largest value) "
-            f"from {rise.from_s:.4g} to {rise.at_s:.4g} s"
-        )
-        text += f"; given by {causes}" if causes else "; nobody gave it"
-        return _StabilityVerdict(StabilityFinding.ROSE, text, rise)
-
     # Energies that are rounding errors are written as zero.
     first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
-    text = "V did not rise"
-    if balance.external:
-        text = f"V rose by no more than the {' and '.join(balance.external)} gave"
-    from_s = balance.t_s[0]
-    to_s = balance.t_s[-1]
-    text += f": {first:.4g} J at {from_s:.4g} s, {last:.4g} J at {to_s:.4g} s"
-    undecided = [premise.text for premise in premises if premise.holds is None]
-    text = "; ".join([text, *undecided])
-
-    if failed:
-        return _StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}; {text}")
-    covered = StabilityFinding.COVERED.value
-    if undecided:
-        covered += ", as far as the log tells"
-    return _StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
+    rise = _find_largest_rise(balance, run.tolerance)
+    course = FunctionalCourse(
+        failed=tuple(premise.name for premise in premises if premise.holds is False),
+        undecided=tuple(premise.quantities for premise in premises if premise.holds is None),
+        external=tuple(balance.external),
+        from_s=float(balance.t_s[0]),
+        to_s=float(balance.t_s[-1]),
+        first_j=float(first),
+        last_j=float(last),
+        largest_j=float(balance.V.max()),
+        rise=rise,
+    )
+    finding = StabilityFinding.COVERED
+    if rise is not None:
+        finding = StabilityFinding.ROSE
+    elif course.failed:
+        finding = StabilityFinding.DID_NOT_RISE
+    return StabilityVerdict(finding, course, rise)
 
 
 JUDGEMENTS = (
@@ -572,7 +494,7 @@ They decide whether the records are false, whether V can be judged, and whether 
 """
 
 
-def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> _FunctionalRise | None:
+def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
     """Finds the largest rise of V above an earlier minimum, and the sources of its energy.
 
     The work of operators and environments is subtracted from V before.
@@ -607,7 +529,7 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> _FunctionalR
     for name in sorted(causes, key=lambda name: -causes[name]):
         if causes[name] > least_amount:
             notable[name] = causes[name]
-    return _FunctionalRise(
+    return FunctionalRise(
         from_s=float(balance.t_s[first]),
         at_s=float(balance.t_s[last]),
         amount=float(rise[last]),
@@ -615,8 +537,8 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> _FunctionalR
     )
 
 
-def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
-    """Describes a growth of the energy V that nobody supplied, although the run looks stable.
+def find_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[UnsuppliedGrowth]:
+    """Finds growths of the energy V that nobody supplied, although the run looks stable.
 
     V is the energy function of the stability proof, from which the work of operators and
     environments is subtracted here. Two rules are checked. First, V must not end above its
@@ -628,25 +550,22 @@ def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list
         tolerance: Size that a rise must exceed to count, in J.
 
     Returns:
-        A sentence for each rule that is violated.
+        The growth for each rule that is violated.
     """
     V = balance.unsupplied
     half = len(V) // 2
-    sentences = []
+    growths = []
     gained = float(V[-1] - V[0])
     if gained > tolerance:
-        sentences.append(f"V ends {gained:.3g} J above its beginning, and nobody gave that")
+        growths.append(UnsuppliedGrowth(gained))
 
     judged = V[half:]
     lowest = int(judged.argmin())
     risen = float(judged[-1] - judged[lowest])
     fell = float(judged[0] - judged[lowest])
     if risen > tolerance and risen > 0.5 * fell:
-        from_s = float(balance.t_s[half + lowest])
-        sentences.append(
-            f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that"
-        )
-    return sentences
+        growths.append(UnsuppliedGrowth(risen, from_s=float(balance.t_s[half + lowest])))
+    return growths
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
@@ -688,7 +607,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
     }
 
 
-def _rise_to_json(rise: _FunctionalRise | None) -> JsonObject | None:
+def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
     """Returns a rise of V as plain values, with the keys of the JSON output."""
     if rise is None:
         return None

@@ -14,7 +14,7 @@ Invariant:
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -207,6 +207,7 @@ def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
 
 Measuring = Callable[[RunView, str], MetricValues]
 """Function that measures a subject of a run, given by its name, and returns its metrics."""
+_DeclaredMeasuring = TypeVar("_DeclaredMeasuring", bound=Measuring)
 
 
 class Measure(NamedTuple):
@@ -257,7 +258,9 @@ _GROUP_ORDER = (
 """Groups in the order in which they are shown; other groups follow."""
 
 
-def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring], Measuring]:
+def measures(
+    of: str, group: str, *quantities: Quantity
+) -> Callable[[_DeclaredMeasuring], _DeclaredMeasuring]:
     """Registers a function that measures some quantities. Use it as a decorator.
 
     The function is called for each run, site (the process that runs one arm), link or wall,
@@ -272,7 +275,7 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
         ValueError: Another function measures one of the quantities.
     """
 
-    def declare(measure: Measuring) -> Measuring:
+    def declare(measure: _DeclaredMeasuring) -> _DeclaredMeasuring:
         definitions = {
             quantity.key: declared for declared in _MEASURES for quantity in declared.quantities
         }

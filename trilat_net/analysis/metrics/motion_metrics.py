@@ -17,6 +17,7 @@ Invariant:
       and the true value is known. Otherwise only the estimate is reported.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -117,7 +118,9 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
 
 
 @measures("site", UNDELAYED, *list_shared_quantities(_UNDELAYED_ERRORS))
-def measure_undelayed_error(view: RunView, site: str) -> MetricValues:
+def measure_undelayed_error(
+    view: RunView, site: str, other: RunView | None = None
+) -> MetricValues:
     """Measures how far a site is from where its peers are at the same time.
 
     The error e of a site compares its coordinates with what its peers sent some time ago. The
@@ -132,17 +135,47 @@ def measure_undelayed_error(view: RunView, site: str) -> MetricValues:
     Args:
         view: The run.
         site: Name of the site.
+        other: A run with the same sites, such as a rerun, which may end earlier. If given, only
+            times are used of which it has a record of the site too.
     """
-    log = view.log
     followed = _list_followed_peers(view, site)
     missing = [name for name in (site, *followed) if name not in view.sites]
     if missing:
         return unavailable(UNDELAYED, f"no records of {', '.join(missing)}")
     if not followed:
         return unavailable(UNDELAYED, f"{site} follows nobody", applies=False)
+    error, known = _compute_undelayed_error(view, site, followed)
+    if other is not None and site in other.sites:
+        # Equal times of different tick rates are equal floats: a division rounds correctly.
+        other_records = other.sites[site].records
+        other_t_s = other_records.t_s[other_records.known]
+        known &= np.isin(view.sites[site].records.t_s, other_t_s)
+    if not known.any():
+        return unavailable(UNDELAYED, "no instant of which every site has a record")
+    return measure_shared(
+        group=UNDELAYED,
+        space=view.scenario.sites[site].task.space,
+        keys=_UNDELAYED_ERRORS,
+        differences=error[known],
+        at_end=view.sites[site].records.known_at_end(END_WINDOW_S)[known],
+        why_not_at_end="in the last second there is no time at which every site has a record",
+    )
 
-    run = view.sites[site]
-    records = run.records
+
+def _compute_undelayed_error(
+    view: RunView, site: str, followed: Mapping[str, Array]
+) -> tuple[Array, Bools]:
+    """Returns a site's distance from where its peers are at the same time.
+
+    Args:
+        view: The run, which has records of the site and of the followed peers.
+        site: Name of the site.
+        followed: Dominance factors of the followed peers over time, shape (K,) each.
+
+    Returns:
+        The distance in every row, shape (K, n), and whether it is known, shape (K,).
+    """
+    records = view.sites[site].records
     t_s = records.t_s
     known = records.known.copy()
     mean = np.zeros_like(records.shared)
@@ -157,21 +190,9 @@ def measure_undelayed_error(view: RunView, site: str) -> MetricValues:
             )
             positions[:, POSITION:] = orientations
         mean += alpha[:, np.newaxis] * positions
-    if not known.any():
-        return unavailable(UNDELAYED, "no instant of which every site has a record")
-
     if records.x.size:
-        error = compute_task_errors(records.x, mean, records.axes)
-    else:
-        error = records.q - mean
-    return measure_shared(
-        group=UNDELAYED,
-        space=log.scenario.sites[site].task.space,
-        keys=_UNDELAYED_ERRORS,
-        differences=error[known],
-        at_end=records.known_at_end(END_WINDOW_S)[known],
-        why_not_at_end="in the last second there is no time at which every site has a record",
-    )
+        return compute_task_errors(records.x, mean, records.axes), known
+    return records.q - mean, known
 
 
 def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:

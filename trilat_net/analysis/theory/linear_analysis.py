@@ -160,7 +160,8 @@ class LinearAnalysis(Result):
             )
         if lacks_detailed_balance(self.scenario):
             notes.append(IRREVERSIBLE_SHARES)
-        return (*notes, *describe_law_conditions(self.scenario))
+        ticks_grow = self.sampled is not None and self.sampled.verdict == "unstable"
+        return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
 
     def headline(self) -> str:
         """Returns the scenario, the verdict and the delay margin in one line.

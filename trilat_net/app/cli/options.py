@@ -494,7 +494,37 @@ def load_chosen_scenario(
     """
     from ...scenario import load_scenario
 
+    _refuse_double_setting(overrides, "duration_s", "--duration", duration)
+    _refuse_double_setting(overrides, "seed", "--seed", seed)
     return load_scenario(source, overrides or [], duration_s=duration, seed=seed)
+
+
+def _refuse_double_setting(
+    overrides: list[str] | None, key: str, option: str, given: float | None
+) -> None:
+    """Checks that the user does not set a key of the scenario in two ways.
+
+    Args:
+        overrides: Texts of --set. None if the option is absent.
+        key: Key of the scenario.
+        option: Another option that sets this key.
+        given: Value of that option. None if the option is absent.
+
+    Raises:
+        UsageError: The key is set by --set and by the other option.
+    """
+    if given is None:
+        return
+    for text in overrides or ():
+        if _find_key(text) == key:
+            raise UsageError(
+                f"--set {text} and {option} {given:g} set the same key {key}: leave one out"
+            )
+
+
+def _find_key(override: str) -> str:
+    """Returns the key of a text of --set, such as "duration_s" of "duration_s=5"."""
+    return override.partition("=")[0].strip()
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
@@ -503,7 +533,11 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
     Args:
         overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
         duration: Value of --duration, in s. It becomes "duration_s=10.0". None if absent.
+
+    Raises:
+        UsageError: Both options set the duration.
     """
+    _refuse_double_setting(overrides, "duration_s", "--duration", duration)
     texts = list(overrides or [])
     if duration is not None:
         texts.append(f"duration_s={duration!r}")
@@ -699,10 +733,13 @@ class RunOptions(NamedTuple):
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
-            longest_s: Duration of the run without --duration, in s. None uses that of the
+            longest_s: Duration of the run if no option sets it, in s. None uses that of the
                 scenario.
         """
-        duration_s = longest_s if self.duration is None else self.duration
+        duration_s = self.duration
+        is_set = any(_find_key(text) == "duration_s" for text in self.overrides or ())
+        if duration_s is None and not is_set:
+            duration_s = longest_s
         return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
 
 

@@ -219,15 +219,17 @@ def certify_command(
     or with --own-laws if it was remembered. docs/logs/certificate.md explains the verdicts and
     leads to every term and key.
 
-    Stable: a proof exists for this loop. Settled: the run came to rest and every push died
-    away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
-    oscillation, drifting, growing, diverged) or open. 2: there is no log.
+    Stable: a proof exists for this loop. Settled: the run came to rest (speeds at most 0.01
+    rad/s) or was decaying, and every push died away, but nothing proves more. Exit code 0:
+    stable. 1: settled, not stable (bounded oscillation, drifting, growing, diverged) or open.
+    2: there is no log, or no site has a record in it.
     """
     from ...analysis import certify_run
     from ...presentation import compose_citation
 
     own_laws = own_laws or bool(laws.law)
     log = laws.open(*files, runs_them=own_laws)
+    log.require_records()
     with terminal.progress_lines(f"judging {files[0]}"):
         certificate = certify_run(
             log, min_coverage=min_coverage, own_laws=own_laws, twins=twins
@@ -312,6 +314,7 @@ def metrics_command(
     from ...analysis import compute_log_metrics
 
     log = terminal.open_with_progress(*file)
+    log.require_records()
     metrics = compute_log_metrics(log)
     terminal.print_result(metrics, as_json=as_json, brief=not everything)
 
@@ -345,8 +348,9 @@ def figure_command(
         width_in: Width of the figures in inches: one or two columns of a paper.
         folder: Folder for the figures; default: the name of FILE with -figures in place of
             .mcap.
-        others: Draw this log together with FILE in one figure, which is named overlay;
-            repeatable.
+        others: Draw this log together with FILE in the same panels, with dashed lines;
+            repeatable. The figures are overlay (largest values of all sites), positions,
+            tracking_errors and control_torques. Their legend names the differing settings.
     """
     log = laws.open(file)
     if listed:
@@ -366,10 +370,6 @@ def figure_command(
 
     settings: dict[str, Any] = {"width_in": width_in, "formats": format_names, "force": force}
     if others:
-        if names:
-            raise UsageError(
-                "--with can draw only the figure overlay: leave out the names of other figures"
-            )
         logs = {file.stem: log}
         logs |= {path.stem: terminal.open_with_progress(path) for path in others}
         if len(logs) <= len(others):
@@ -377,7 +377,7 @@ def figure_command(
             raise UsageError(
                 "logs that are drawn over one another must have different file names"
             )
-        paths = write_overlay(logs, out, **settings)
+        paths = write_overlay(logs, out, names or (), **settings)
     else:
         with terminal.progress_bar("drawing") as progress:
             paths = write_figures(log, out, names or (), progress=progress, **settings)
@@ -441,6 +441,7 @@ def report_command(
     from ..api import choose_report_folder
 
     log = laws.open(*files)  # so that no folder is created for a log that cannot be read
+    log.require_records()
     if folder is None:
         # The sender of the log may have placed a symbolic link at the default path.
         folder = choose_report_folder(files[0])

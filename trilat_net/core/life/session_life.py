@@ -13,8 +13,8 @@ when its peers appear or fall silent. A site has one of these modes:
 - FAULT: A limit was exceeded, a number was not finite, or the arm was lost. The arm comes to
   rest. Only the order RESET leads back to WAITING.
 - STOPPED: The arm was stopped by order, or its dead-man switch was released. The arm comes to
-  rest. The order ENABLE leads back to WAITING. If the switch was the cause, holding the switch
-  again does so too.
+  rest. The order ENABLE leads back to WAITING. If the switch was the only cause, holding the
+  switch again does so too.
 
 The reference of a site is the position that its arm follows. In RUN, it is the weighted mean of
 the positions of the peers. In RETURN, an offset is added, which falls from its start value D to
@@ -88,6 +88,7 @@ _RESET = int(LifeReason.RESET)
 _ARM_SILENT = int(LifeReason.ARM_SILENT)
 _ARM_BACK = int(LifeReason.ARM_BACK)
 _RELEASED = int(LifeReason.RELEASED)
+_STOP_RELEASED = int(LifeReason.STOP_RELEASED)
 _HELD = int(LifeReason.HELD)
 _ORDER_STOP = int(LifeOrder.STOP)
 _ORDER_ENABLE = int(LifeOrder.ENABLE)
@@ -329,8 +330,12 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
         enter_rest(t_ns, _WAITING, _ENABLE, site)
     elif order == _ORDER_HELD and mode == _STOPPED and site.reason == _RELEASED:
         enter_rest(t_ns, _WAITING, _HELD, site)
-    elif order == _ORDER_STOP and mode == _STOPPED:
-        site.reason = _STOP
+    elif order == _ORDER_STOP and site.reason == _RELEASED and mode == _STOPPED:
+        # The brakes of a real arm hold it since the release, and must not open again.
+        site.reason = _STOP_RELEASED
+    elif order == _ORDER_RELEASED and site.reason == _STOP and mode == _STOPPED:
+        # Until now a torque held the arm, which nobody supervises any more.
+        site.reason = _STOP_RELEASED
     elif stops and mode != _FAULT and mode != _STOPPED:
         reason = _STOP if order == _ORDER_STOP else _RELEASED
         latch_mode(t_ns, site, _STOPPED, reason)

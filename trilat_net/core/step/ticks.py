@@ -84,6 +84,11 @@ class LifeReason(IntEnum):
     DROPPED = 17
     RESTORED = 18
     RESUMED = 19
+    STOP_RELEASED = 20
+
+
+RELEASE_REASONS = (LifeReason.RELEASED, LifeReason.STOP_RELEASED)
+"""Reasons of a stop after a release of the dead-man switch, so that brakes hold the arm."""
 
 
 class LifeOrder(IntEnum):
@@ -233,6 +238,7 @@ _REASONS = {
     LifeReason.ARM_SILENT: "its arm is silent",
     LifeReason.RELEASED: "its dead-man switch is not held",
     LifeReason.HELD: "its dead-man switch is held",
+    LifeReason.STOP_RELEASED: "it was ordered to stop, and its dead-man switch was released",
     LifeReason.DROPPED: "a lost peer has no share any more",
     LifeReason.RESTORED: "a peer that was lost has its share again",
 }

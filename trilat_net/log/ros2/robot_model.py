@@ -8,6 +8,7 @@ shapes, plain ones are added, so that the arm can be seen. The files of meshes a
 Invariant:
     - The frame of a link is named "<site>/<link>", both in the URDF and in the transforms, so
       that arms with the same URDF can be shown together.
+    - The joints have the same names in the URDF as in the messages with joint states.
     - The transforms place the end effector where the site computes it.
 """
 
@@ -178,7 +179,26 @@ def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
 
 
 _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
-"""URDF of the planar arm, with the lengths of its links as placeholders."""
+"""URDF of the planar arm, with placeholders for names of joints and lengths of links."""
+
+
+def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
+    """Lists the names of an arm's joints, as ROS messages and the URDF for viewers state them.
+
+    Joints keep the names of their URDF. If no arm of the scenario has a URDF, the joints have
+    the same names at all sites, therefore the name of the site is put in front: "m1_q1".
+
+    Args:
+        scenario: Scenario of the session.
+        site: Name of the site that runs the arm.
+
+    Returns:
+        The names, in the order of q.
+    """
+    arm = scenario.arms[site]
+    if arm.chain is not None:
+        return [*arm.joint_names]
+    return [f"{site}_{name}" for name in arm.joint_names]
 
 
 class RobotModel:
@@ -201,18 +221,19 @@ class RobotModel:
     def __init__(self, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site].arm
         site_number = scenario.names.index(site)
+        joint_names = name_ros_joints(scenario, site)
         if spec.urdf:
             arm_model = read_arm(spec, scenario.urdf)
             base = arm_model.base
             urdf = scenario.urdf[spec.urdf]
         else:
             base = "base"
-            urdf = _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
+            q1, q2 = joint_names
+            urdf = _PLANAR.format(q1=q1, q2=q2, l1_m=spec.l1_m, l2_m=spec.l2_m)
         root = ElementTree.fromstring(urdf)
         base_frame = f"{site}/{base}"
         self.frames = [(WORLD, base_frame)]
         self._joints: list[_JointFrame] = []
-        joint_names = scenario.arms[site].joint_names
         for joint in _list_joints(root, base):
             parent = _get_link(joint, "parent")
             child = _get_link(joint, "child")

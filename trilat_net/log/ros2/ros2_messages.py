@@ -29,7 +29,7 @@ from ...net import MODE_WORDS, Event, LinkStats, State
 from ...records import Mode, TickRecord
 from ...scenario import TASK_AXES, Scenario, describe_event
 from . import cdr
-from .robot_model import RobotModel
+from .robot_model import RobotModel, name_ros_joints
 
 EVENTS = "events"
 """Channel of the session's events as plain text."""
@@ -238,9 +238,7 @@ class Ros2SiteChannels:
         self.robot: RobotModel | None = None
         if arm.chain is not None:
             self.robot = RobotModel(scenario, site)
-        self.joints = [*arm.joint_names]
-        if self.robot is None:
-            self.joints = [f"{site}_{name}" for name in arm.joint_names]
+        self.joints = name_ros_joints(scenario, site)
         sent_arrays = _make_sent_arrays(scenario, site)
         self._slow_names = ("tau_x", "theta_hat", *sent_arrays, "mode")
         self.record_arrays = ("error", *self._slow_names)

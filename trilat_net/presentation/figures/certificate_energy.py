@@ -24,19 +24,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import (
-    Certificate,
-    EnergyBalance,
-    ObservedEnergy,
-    certify,
-    explain_no_functional,
-    find_unjudged_spans,
-)
+from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify, find_unjudged_spans
 from ...core import Array
 from ...log import Log
 from ...own_code import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
+from ..premise_text import explain_no_functional
 from .figure_entry import draws, unless
 
 _PART_LABELS = {

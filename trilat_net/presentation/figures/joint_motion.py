@@ -198,12 +198,14 @@ def _draw_joints(
     return plot.figure
 
 
-def _add_joint_rows(
-    plot: style.TimeFigure,
+def add_joint_rows(
+    figure: Figure,
+    log: Log,
     form: FigureSize,
     heads: Sequence[str],
     labels: Sequence[str],
     sharey: str,
+    titles: Sequence[str] = (),
 ) -> tuple[list[list[Axes]], list[Axes]]:
     """Adds a panel per quantity and joint to a figure.
 
@@ -211,25 +213,27 @@ def _add_joint_rows(
     have a row per joint and a column per quantity, because a row of many joints would not fit.
 
     Args:
-        plot: The figure.
+        figure: The figure.
+        log: Log with the joints.
         form: Width, type sizes and resolution of the figure.
         heads: Title of each quantity, used above a column.
         labels: Label of each quantity, used beside a row.
         sharey: "col" if the quantities of a joint share their value axis, otherwise "none".
+        titles: Titles of the joints. Empty for their names.
 
     Returns:
         The panels, by quantity and then by joint, and the lowest panel of each column.
     """
-    titles = style.name_joints(plot.log)
+    titles = titles or style.name_joints(log)
     if len(titles) == 2:
-        grid = style.add_panels(plot.figure, len(labels), 2, sharex=True, sharey=sharey)
-        style.title_joints(plot.log, grid[0])
+        grid = style.add_panels(figure, len(labels), 2, sharex=True, sharey=sharey)
+        style.title_joints(log, grid[0], titles)
         for row, label in zip(grid, labels, strict=True):
             row[0].set_ylabel(label)
         return [list(row) for row in grid], list(grid[-1])
 
     grid = style.add_panels(
-        plot.figure, len(titles), len(heads), sharex=True, sharey=_TRANSPOSED[sharey]
+        figure, len(titles), len(heads), sharex=True, sharey=_TRANSPOSED[sharey]
     )
     for row, title in zip(grid, titles, strict=True):
         style.label_row(row[0], title, form)
@@ -252,10 +256,10 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     heads = ("torque on the arm (N m)", "joint angle (rad)")
     if form.narrow:
         heads = ("torque (N m)", "angle (rad)")
-    height_in = _choose_height_in(log, 2.9 if form.narrow else 3.4)
+    height_in = choose_height_in(log, 2.9 if form.narrow else 3.4)
     with style.time_figure(log, form, height_in) as plot:
-        (torques, angles), lowest = _add_joint_rows(
-            plot=plot, form=form, heads=heads, labels=heads, sharey="none"
+        (torques, angles), lowest = add_joint_rows(
+            figure=plot.figure, log=log, form=form, heads=heads, labels=heads, sharey="none"
         )
         if len(torques) == 2:
             torques[1].sharey(torques[0])
@@ -269,7 +273,7 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-def _choose_height_in(log: Log, two_joints_in: float) -> float:
+def choose_height_in(log: Log, two_joints_in: float) -> float:
     """Returns the height of a figure that has a row per joint if there are more than two.
 
     Args:
@@ -297,10 +301,10 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     heads = [f"{site}: q (rad)" for site in log.sites]
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
     row_in = 0.95 if form.narrow else 1.25
-    height_in = _choose_height_in(log, 0.7 + row_in * len(log.sites))
+    height_in = choose_height_in(log, 0.7 + row_in * len(log.sites))
     with style.time_figure(log, form, height_in) as plot:
-        grid, lowest = _add_joint_rows(
-            plot=plot, form=form, heads=heads, labels=labels, sharey="col"
+        grid, lowest = add_joint_rows(
+            figure=plot.figure, log=log, form=form, heads=heads, labels=labels, sharey="col"
         )
         for site, row in zip(log.sites, grid, strict=True):
             actual = site_signals.joint_angles(log[site])

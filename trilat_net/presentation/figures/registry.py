@@ -25,7 +25,8 @@ from ...errors import UsageError, suggest_nearest
 from ...files import make_folder, refuse_existing
 from ...log import Log, Progress, open_log
 from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize
-from ..style import FIGURE_FORMATS, write_figure
+from ..style import DASHES, FIGURE_FORMATS, write_figure
+from .compared_runs import COMPARED_SIGNALS, draw_compared_runs, list_common_sites
 from .figure_entry import FigureEntry, list_figures
 from .joint_motion import draw_operator_displacement
 from .run_overview import draw_overlay
@@ -117,20 +118,28 @@ def write_figures(
     )
 
 
+OVERLAY = "overlay"
+"""Name of the figure that compares the largest values of several runs."""
+
+
 def write_overlay(
     logs: Mapping[str, Log],
     folder: Path,
+    names: Sequence[str] = (),
     *,
     width_in: float = COLUMN_IN,
     formats: Sequence[str] = FIGURE_FORMATS[:2],
     force: bool = False,
 ) -> list[Path]:
-    """Writes a figure that compares several runs, as overlay.pdf and in other formats.
+    """Writes figures that compare several runs, as overlay.pdf and overlay_positions.pdf.
 
     Args:
         logs: The logs, by their names in the legend.
         folder: Folder of the files. It is created if it does not exist.
-        width_in: Width of the figure, 3.5 or 7 in.
+        names: Names of the figures: overlay, positions, tracking_errors or control_torques.
+            Empty for all of them; if there are too many runs, or no common site, for overlay
+            alone.
+        width_in: Width of the figures, 3.5 or 7 in.
         formats: Formats of the files, of `FIGURE_FORMATS`.
         force: True to overwrite existing files.
 
@@ -138,11 +147,23 @@ def write_overlay(
         The paths of the files.
 
     Raises:
-        UsageError: The width or a format does not exist, the errors of the logs have different
-            units, or a file exists.
+        UsageError: A figure, the width or a format does not exist, the errors of the logs have
+            different units, the logs cannot be drawn in a figure, or a file exists.
     """
     form = FigureSize.for_print(width_in)
-    drawings = {"overlay": partial(draw_overlay, logs, form)}
+    known = (OVERLAY, *COMPARED_SIGNALS)
+    for name in names:
+        if name not in known:
+            raise UsageError(f"figures of several logs are {', '.join(known)}, not {name!r}")
+    if not names:
+        has_panels = len(logs) <= len(DASHES) and list_common_sites(logs)
+        names = known if has_panels else (OVERLAY,)
+    drawings: dict[str, Callable[[], Figure]] = {}
+    for name in dict.fromkeys(names):
+        if name == OVERLAY:
+            drawings[OVERLAY] = partial(draw_overlay, logs, form)
+        else:
+            drawings[f"{OVERLAY}_{name}"] = partial(draw_compared_runs, logs, name, form)
     return _write(drawings, folder, form, formats, force=force)
 
 

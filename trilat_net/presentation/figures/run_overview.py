@@ -32,6 +32,7 @@ from ...log import Log
 from ...own_code import may_run_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
+from .compared_runs import label_runs
 from .figure_entry import draws
 
 _HEIGHT_IN = 3.9
@@ -138,7 +139,8 @@ def _compose_title(log: Log, form: FigureSize) -> str:
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws several runs over one another in one figure, to compare them.
 
-    The figure has the four panels of a run's overview. Each panel has a line for each run.
+    The figure has the four panels of a run's overview. Each panel has a line for each run, and
+    the legend names the settings in which the runs differ.
 
     Args:
         logs: Logs of the runs, by their names in the legend.
@@ -169,7 +171,8 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
             axes.set_xlim(0.0, end_s)
         for axes in _list_lowest(panels, form):
             axes.set_xlabel("time (s)")
-        style.add_legend(figure, list(lines.items()))
+        labels = label_runs(logs, form)
+        style.add_legend(figure, [(labels[name], line) for name, line in lines.items()])
     return figure
 
 

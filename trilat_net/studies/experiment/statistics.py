@@ -15,7 +15,6 @@ from trilat_people.experiment.statistics import (
     power,
     simulate_power,
     summarise_conditions,
-    write_methods,
 )
 
 __all__ = [
@@ -33,5 +32,4 @@ __all__ = [
     "power",
     "simulate_power",
     "summarise_conditions",
-    "write_methods",
 ]

@@ -9,7 +9,8 @@ from tests.cli.running import shorten, trilat
 
 def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
     assert (
-        "run it with" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
+        "trilat experiment run reaching.toml"
+        in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
     )
     assert (
         "12 participants"
@@ -28,8 +29,8 @@ def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
     output = trilat(
         "experiment", "analyse", folder, "--exclude", "P2=late", cwd=tmp_path
     ).succeeds()
-    assert "1 more was excluded (P2: late)" in output
-    assert f"{folder}/analysis/methods.txt" in output
+    assert "excluded: 1\nexclusions: P2 late\n" in output
+    assert f"{folder}/analysis/analysis.json" in output
     next((tmp_path / folder / "logs").iterdir()).unlink()
     assert "is missing" in trilat("experiment", "status", folder, cwd=tmp_path).err
 
@@ -68,4 +69,4 @@ def test_two_person_protocols_run_as_written(tmp_path: Path) -> None:
     refused = trilat(
         "experiment", "run", "two-people.toml", "--live", "--host", "0.0.0.0", cwd=tmp_path
     )
-    assert "say --insecure" in " ".join(refused.err.split())
+    assert "give --insecure" in " ".join(refused.err.split())

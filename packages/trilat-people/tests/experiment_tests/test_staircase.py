@@ -128,9 +128,10 @@ def test_choices_and_threshold_are_in_the_tables(done: Experiment) -> None:
         right = [bool(row["right"]) for row in list(block)[1::2]]
         assert found.get(who) == stairs.find_threshold(right)
     assert (
-        "control.K was adapted in a two-interval forced choice against 100" in analysis.methods
+        "control.K was adapted in a two-interval forced choice against 100"
+        in analysis.study["staircase"]
     )
-    assert "70.7 % right" in analysis.methods
+    assert "70.7 % right" in analysis.study["staircase"]
 
 
 def test_reruns_are_equal_and_ask_nothing_twice(done: Experiment) -> None:

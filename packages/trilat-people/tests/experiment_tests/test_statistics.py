@@ -3,7 +3,7 @@
 import io
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ import pytest
 from scipy import stats
 from trilat_people.experiment.condition_figures import draw_conditions
 from trilat_people.experiment.statistics import (
-    COMPUTED,
     Row,
     average_trials,
     bootstrap_interval,
@@ -22,7 +21,6 @@ from trilat_people.experiment.statistics import (
     power,
     simulate_power,
     summarise_conditions,
-    write_methods,
 )
 
 from trilat_net.errors import UsageError
@@ -324,80 +322,7 @@ def test_without_effect_families_keep_alpha() -> None:
     assert families <= stats.binom.ppf(0.999, 300, 0.05)
 
 
-# --- methods paragraph and figure ------------------------------------------------------------------------
-
-FACTS: dict[str, Any] = {
-    "participants": 16,
-    "pairs": 8,
-    "excluded": 2,
-    "exclusions": ["left after block 1", "a site was cut off for 31.5 s"],
-    "design": "within participants, counterbalanced by a Williams square",
-    "blocks": 3,
-    "trials": 10,
-    "conditions": {
-        "near": {"delay_ms": 3.217, "delay_deviation_ms": 0.41},
-        "far": {"delay_ms": 301.93, "delay_deviation_ms": 2.75, "loss_percent": 0.125},
-    },
-    "law": "p_d",
-    "gains": {"K": 20.0, "d": [15.25, 14.5], "T_max_ms": 320},
-    "rate_hz": 1000,
-    "seeds": [71, 72],
-    "measures": ["completion_time_s", "path_m", "sparc"],
-    "correction": "Holm",
-    "alpha": 0.05,
-    "computed": COMPUTED,
-    "program": "0.1.0",
-    "digest": "9f2c",
-}
-
-
-def numbers(value: Any) -> Iterator[float]:
-    """Every number within a value."""
-    if isinstance(value, Mapping):
-        value = list(value.values())
-    if isinstance(value, list):
-        for one in value:
-            yield from numbers(one)
-    elif isinstance(value, int | float):
-        yield float(value)
-
-
-def test_methods_paragraph_has_every_number_it_was_given() -> None:
-    text = write_methods(FACTS)
-    said = {float(one) for one in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*\d)", text)}
-    assert set(numbers(FACTS)) <= said
-    assert "\n" not in text
-    assert text.endswith(".")
-    for words in (
-        "delay 301.93 ms", "loss 0.125 %", "T max 320 ms", "at 1000 Hz", "Williams", "corrected by Holm",
-        "completion time in s, path in m, sparc", "left after block 1",
-    ):  # fmt: skip
-        assert words in text
-
-
-def test_methods_paragraph_omits_missing_facts() -> None:
-    text = write_methods(
-        {k: v for k, v in FACTS.items() if k not in ("pairs", "blocks", "exclusions", "alpha")}
-    )
-    assert "pairs" not in text
-    assert "2 more were excluded. The design" in text
-    assert "alpha" not in text
-
-
-@pytest.mark.parametrize(
-    ("changed", "says"),
-    [
-        ({"seeds": None}, "needs seeds"),
-        ({"seats": 3}, "unknown facts: seats; the known facts are participants"),
-        ({"conditions": {"near": {"loss_percent": 1}}}, "condition near has no delay"),
-    ],
-)
-def test_methods_paragraph_refuses_incomplete_studies(
-    changed: dict[str, Any], says: str
-) -> None:
-    facts = {key: value for key, value in {**FACTS, **changed}.items() if value is not None}
-    with pytest.raises(UsageError, match=says):
-        write_methods(facts)
+# --- figure ------------------------------------------------------------
 
 
 def test_every_participant_is_drawn_under_every_condition() -> None:

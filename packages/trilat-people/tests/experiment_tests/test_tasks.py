@@ -161,7 +161,7 @@ def test_learning_is_before_less_after(tmp_path: Path) -> None:
     assert found.means["gain_after_error_rms_mm"][0].number == 1
     assert (
         "the expert's part of the authority went from 0.9 to 0.1 (near), 0.5 to 0.5 (far)"
-        in found.methods
+        in found.study["training"]
     )
 
 

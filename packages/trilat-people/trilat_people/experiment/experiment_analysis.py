@@ -1,4 +1,4 @@
-"""Analyses an experiment with people: means, comparisons, figures, and a methods paragraph.
+"""Analyses an experiment with people: means, comparisons and figures.
 
 `analyse_experiment` reads the journals of an experiment's folder and writes tables, figures and
 a report into the folder. `compute_experiment_power` plans the number of participants.
@@ -11,7 +11,7 @@ Invariant:
     - Every measure that trials have is summarised, also if all its values are equal. If numbers
       of a measure are missing, their number is stated.
     - Every number in a figure or a sentence is also in a table.
-    - The methods paragraph describes the analyses that were computed, and no others.
+    - The facts of the study name the analyses that were computed, and no others.
 """
 
 import json
@@ -28,6 +28,7 @@ import numpy as np
 
 from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
+from trilat_net.fields import split_unit
 from trilat_net.files import find_version, make_folder, make_subfolder, write_whole
 from trilat_net.presentation import Block, TextTable, compose, format_number, style
 from trilat_net.results import Result
@@ -48,6 +49,7 @@ from .experiment_run import Experiment, open_experiment
 from .movement_measures import measure_throughput
 from .statistics import (
     CONFIDENCE,
+    RESAMPLES,
     Comparison,
     ConditionMean,
     MixedModel,
@@ -60,7 +62,6 @@ from .statistics import (
     power,
     simulate_power,
     summarise_conditions,
-    write_methods,
 )
 
 MEASURES = (
@@ -99,8 +100,33 @@ class _MissingAnswers(NamedTuple):
     unscored: int
 
 
+def _format_fact(value: Any, name: str = "") -> str:
+    """Returns a fact of a study as text, with all digits of its numbers.
+
+    A number gets the unit at the end of its name: {"delay_ms": 50} becomes "delay 50 ms".
+    Several entries or items are joined by commas, and conditions by semicolons.
+
+    Args:
+        value: The fact: a number, a text, a mapping or a sequence.
+        name: Name of the fact, whose ending states the unit.
+    """
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Mapping):
+        items: list[str] = []
+        for key, item in value.items():
+            quantity, _ = split_unit(key)
+            items.append(f"{quantity} {_format_fact(item, key)}".strip())
+        return "; ".join(items) if name == "conditions" else ", ".join(items)
+    if isinstance(value, Sequence):
+        return ", ".join(_format_fact(item, name) for item in value)
+    number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
+    _, unit = split_unit(name)
+    return f"{number} {unit}".strip()
+
+
 class ExperimentAnalysis(Result):
-    """The statistics of an experiment: comparisons of its conditions, and texts for a paper.
+    """The statistics of an experiment: comparisons of its conditions, and facts of the study.
 
     Creating this object computes everything except the figures, which `write` draws. A unit is
     a participant or a pair, whichever is sampled independently.
@@ -127,7 +153,8 @@ class ExperimentAnalysis(Result):
         absent: For each measure that this experiment could have but that no trial has a number
             for, the reason.
         models: Mixed models of the forces of users within pairs.
-        methods: Methods paragraph of a paper.
+        study: Facts of the study that a paper states: participants, conditions with the
+            measured delays, law, gains, seed, and the analyses that were computed.
         paths: Files that were written.
 
     Raises:
@@ -168,7 +195,7 @@ class ExperimentAnalysis(Result):
             self._compare_measure(measure)
         self.missing_answers = list(self._count_missing_answers())
         self.models = list(self.fit_models())
-        self.methods = self._write_methods()
+        self.study = self._collect_study()
         self.paths: list[Path] = []
 
     def _check_excluded(self) -> None:
@@ -460,111 +487,75 @@ class ExperimentAnalysis(Result):
                     staircase.measure: threshold,
                 }
 
-    def _write_methods(self) -> str:
-        """Returns the methods paragraph of a paper, with the numbers of this experiment.
+    def _collect_study(self) -> dict[str, Any]:
+        """Returns the facts of the study that a paper states.
 
-        It states participants, design, delays, control law, gains, measures, the tests that
-        were computed, and the digest of the plan. `write_methods` forms the sentences.
+        Facts that do not apply, such as `pairs` with single users, are missing.
+
+        Returns:
+            Plain values by name. `conditions` maps each condition to the mean of the measured
+            delays, `delay_ms`. `excluded` is the number of participants of the plan whose data
+            do not count. `computed` lists the analyses, for example "t tests".
         """
         plan = self._experiment.plan
         protocol = plan.protocol
         scenario = next(iter(plan.scenarios.values()))
-        number = len({row[self.unit] for row in self.rows})
-        participants = number * len(protocol.users)
-        delays = {}
+        unit_count = len({row[self.unit] for row in self.rows})
+        participant_count = unit_count * len(protocol.users)
+        conditions: dict[str, dict[str, float]] = {}
         for name in protocol.conditions:
             delays_ms = [row["delay_ms"] for row in self.rows if row["condition"] == name]
             if delays_ms:
-                delays[name] = {"delay_ms": round(float(np.mean(delays_ms)), 1)}
+                conditions[name] = {"delay_ms": round(float(np.mean(delays_ms)), 1)}
         site = scenario.sites[protocol.users[0]]
         control = msgspec.to_builtins(site.control)
-        exclusions: list[str] = []
-        for name, reason in self._exclude.items():
-            exclusions.append(f"{name}: {reason}" if reason else name)
-        # The paragraph does not mention facts that are "".
+        law = control.pop("law")
         facts: dict[str, Any] = {
-            "participants": participants,
-            "pairs": number if self.unit == "pair" else "",
-            "excluded": len(protocol.groups) * len(protocol.users) - participants,
-            "exclusions": ", ".join(exclusions),
-            "training": protocol.training.describe() if protocol.training else "",
-            "staircase": protocol.staircase.describe() if protocol.staircase else "",
+            "participants": participant_count,
+            "pairs": unit_count if self.unit == "pair" else None,
+            "excluded": len(protocol.groups) * len(protocol.users) - participant_count,
+            "exclusions": dict(self._exclude) or None,
             "design": protocol.design,
             "blocks": len(protocol.conditions),
             "trials": protocol.trials,
-            "conditions": delays,
-            "law": control.pop("law"),
-            "rate_hz": site.rate_hz,
+            "training": protocol.training.describe() if protocol.training else None,
+            "staircase": protocol.staircase.describe() if protocol.staircase else None,
+            "conditions": conditions,
+            "law": law,
             "gains": control,
-            "seeds": [protocol.seed],
-            "program": f"trilat-net {find_version()}",
-            "digest": plan.digest,
+            "rate_hz": site.rate_hz,
+            "seed": protocol.seed,
             "measures": list(self.means),
             "unit": self.unit,
-            "correction": "Holm",
             "computed": self._list_computed(),
-            "completion": self._describe_times(),
-            "answers": self._describe_missing_answers(),
+            "program": f"trilat-net {find_version()}",
+            "digest": plan.digest,
         }
-        return write_methods(facts)
+        return {name: value for name, value in facts.items() if value is not None}
 
     def _list_computed(self) -> list[str]:
-        """Lists the analyses that were computed, so that the methods paragraph names no others.
+        """Lists the analyses that were computed.
 
-        Example: ["intervals", "t tests", "effect sizes"]. With one participant the list is
-        empty.
+        Example: ["intervals of 95 %", "effect sizes"]. With one participant the list is empty.
         """
         tests = list(chain.from_iterable(self.comparisons.values()))
         means = list(chain.from_iterable(self.means.values()))
+        has_intervals = any(mean.interval is not None for mean in means)
+        has_bootstrap = any(mean.bootstrap is not None for mean in means)
+        has_sign_tests = any(test.p is not None for test in self.time_comparisons)
         is_computed = {
-            "intervals": any(mean.interval is not None for mean in means),
-            "bootstrap": any(mean.bootstrap is not None for mean in means),
-            "t tests": any(test.p is not None for test in tests),
-            "wilcoxon": any(test.p_wilcoxon is not None for test in tests),
+            f"intervals of {100 * CONFIDENCE:g} %": has_intervals,
+            f"bootstrap with {RESAMPLES} resamples": has_bootstrap,
+            "t tests with p corrected by Holm": any(test.p is not None for test in tests),
+            "Wilcoxon tests": any(test.p_wilcoxon is not None for test in tests),
             "effect sizes": any(test.d_z is not None for test in tests),
-            "sign tests": any(test.p is not None for test in self.time_comparisons),
+            "sign tests of completion times": has_sign_tests,
             "mixed models": bool(self.models),
         }
         return [analysis for analysis, computed in is_computed.items() if computed]
 
-    def _describe_times(self) -> str:
-        """Returns the sentence of the methods paragraph about trials that were not completed.
-
-        It states how many ran into the time limit and how many failed sooner. Empty if all
-        trials were completed.
-        """
-        trials = sum(time.trials for time in self.times)
-        censored = sum(time.censored for time in self.times)
-        if not censored:
-            return ""
-        timed_out = sum(time.timed_out for time in self.times)
-        sooner = censored - timed_out
-        failed = f" and {sooner} failed sooner" if sooner else ""
-        return (
-            f"{timed_out} of {count_nouns(trials, 'trial')} ran into the time limit of "
-            f"{self._limit_s:g} s{failed}; their completion times are right-censored, "
-            "and completion is summarised by the median of Kaplan and Meier "
-            f"per {self.unit} and condition"
-        )
-
-    def _describe_missing_answers(self) -> str:
-        """Returns the sentence of the methods paragraph about missing answers.
-
-        Empty if no answer to a questionnaire is missing.
-        """
-        missing = sum(answers.missing for answers in self.missing_answers)
-        question_count = sum(answers.asked for answers in self.missing_answers)
-        unscored = sum(answers.unscored for answers in self.missing_answers)
-        if not missing:
-            return ""
-        plural = "questionnaire has" if unscored == 1 else "questionnaires have"
-        return (
-            f"{missing} of {count_nouns(question_count, 'answer is', 'answers are')} missing; "
-            f"{unscored} {plural} no score for that reason"
-        )
-
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes tables, figures, the methods paragraph and a report into a folder.
+        """Writes tables, figures and a report into a folder.
 
         Afterwards, `paths` lists the written files.
 
@@ -589,7 +580,7 @@ class ExperimentAnalysis(Result):
         return self
 
     def _encode_files(self) -> dict[str, str]:
-        """Returns the contents of the tables, the methods paragraph and the JSON by file name.
+        """Returns the contents of the tables and of the JSON by file name.
 
         Tables about completion times and missing answers exist only if they have a row.
         """
@@ -607,7 +598,6 @@ class ExperimentAnalysis(Result):
         for name, rows in tables.items():
             flat_rows = [dict(_flatten(row)) for row in rows]
             texts[name] = encode_csv(flat_rows)
-        texts["methods.txt"] = f"{self.methods}\n"
         texts["analysis.json"] = json.dumps(self.to_dict(), indent=1) + "\n"
         return texts
 
@@ -695,7 +685,7 @@ class ExperimentAnalysis(Result):
         """Returns all results of the experiment as plain values.
 
         These are the means of the conditions, their comparisons, completion times, missing
-        answers, fitted models and the methods paragraph. `trilat experiment analyse --json`
+        answers, fitted models and the facts of the study. `trilat experiment analyse --json`
         prints them.
         """
         models = {model.measure: model._asdict() for model in self.models}
@@ -711,7 +701,7 @@ class ExperimentAnalysis(Result):
             "missing_answers": [answers._asdict() for answers in self.missing_answers],
             "absent": self.absent,
             "mixed_models": models,
-            "methods": self.methods,
+            "study": self.study,
         }
 
     def blocks(self) -> Iterator[Block]:
@@ -719,7 +709,7 @@ class ExperimentAnalysis(Result):
 
         The parts are a summary of completed trials, the means and comparisons of the measures,
         the fitted models, the number of missing questionnaire answers, the reasons why a
-        measure has no number, and the methods paragraph. With a single participant or pair
+        measure has no number, and the facts of the study. With a single participant or pair
         there are no comparisons, and one table has all measures.
         """
         yield from self._write_time_blocks()
@@ -744,7 +734,8 @@ class ExperimentAnalysis(Result):
             yield f"{measure}: no number, because {reason}"
         if self.missing_answers or self.absent:
             yield ""
-        yield self.methods
+        for name, fact in self.study.items():
+            yield f"{name}: {_format_fact(fact, name)}"
 
     def _write_time_blocks(self) -> Iterator[Block]:
         """Yields a table of completion times: trials, failures and median for each condition.

@@ -1,4 +1,4 @@
-"""Computes statistics of experiments with people: means, tests, power, and a methods paragraph.
+"""Computes statistics of experiments with people: means, tests and power.
 
 All functions read tidy rows: each trial is a mapping with `participant`, `pair`, `condition`
 and the measures by name, as in `trials.csv`. A trial whose value of a measure is None or ""
@@ -14,11 +14,10 @@ Invariant:
 """
 
 import math
-import re
 import warnings
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -27,7 +26,6 @@ import numpy as np
 
 from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
-from trilat_net.fields import split_unit
 from trilat_net.files import import_extra
 from trilat_net.work import MeanInterval, wilson_interval
 
@@ -727,182 +725,3 @@ def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> 
         interval=wilson_interval(significant, len(runs)),
         found_holm=significant_holm / len(runs),
     )
-
-
-# --- methods paragraph ------------------------------------------------------------------------
-
-_METHODS = (
-    ("participants", "The data of {} participants"),
-    ("pairs", " in {} pairs"),
-    ("excluded", " were analysed; {} more were excluded"),
-    ("exclusions", " ({})"),
-    ("design", ". The design was {},"),
-    ("blocks", " in {} blocks"),
-    ("trials", " with {} trials of every participant under a condition."),
-    ("training", " {}."),
-    ("staircase", " {}."),
-    ("conditions", " Conditions, with delays as measured, were: {}."),
-    ("law", " The arms ran the control law {}"),
-    ("rate_hz", " at {}"),
-    ("gains", " with the gains {};"),
-    ("seeds", " random numbers had the seeds {}"),
-    ("program", "; the program was {}"),
-    ("digest", "; the digest of the protocol is {}"),
-    ("measures", ". Measures were {}, averaged"),
-    ("unit", " per {}"),
-)  # fmt: skip
-"""Each fact and the text that states it, in the order of the paragraph."""
-COMPUTED = (
-    "t tests", "wilcoxon", "effect sizes", "intervals", "bootstrap", "sign tests",
-    "mixed models",
-)  # fmt: skip
-"""Analyses that the paragraph describes if they were computed."""
-_ENDING = ("correction", "alpha", "completion", "answers", "computed")
-"""Facts that the last sentences state."""
-_OPTIONAL = (
-    "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest",
-    "unit", "alpha", "completion", "answers", "computed",
-)  # fmt: skip
-"""Facts that may be missing."""
-
-
-def write_methods(facts: Mapping[str, Any]) -> str:
-    """Writes the methods paragraph of a paper, which states every number of the facts.
-
-    Args:
-        facts: Facts by name. Keys of numbers end in their unit.
-            `participants`: number of participants whose data count.
-            `excluded`: number of further participants; `exclusions`: the reasons.
-            `pairs`, `design`, `blocks`: number of pairs, the design, number of blocks.
-            `trials`: number of trials of a participant under a condition.
-            `training`, `staircase`: their descriptions.
-            `conditions`: the settings of each condition by its name, with the measured delay
-            (`delay_ms`).
-            `law`, `gains`, `rate_hz`, `seeds`: of the arms' control and the random numbers.
-            `measures`: names of the measures; `unit`: the unit over which they are averaged.
-            `correction`, `alpha`: correction of p, and the significance level.
-            `program`, `digest`: version of the program, and digest of the protocol.
-            `computed`: the analyses of `COMPUTED` that were computed, by default none of them.
-            `completion`, `answers`: sentences on trials that were not completed and on missing
-            answers.
-
-    Raises:
-        UsageError: A fact is missing or unknown, or a condition has no delay.
-    """
-    _check_facts(facts)
-    texts = {key: _format_fact(value, key) for key, value in facts.items()}
-    conditions: list[str] = []
-    for name, condition in facts["conditions"].items():
-        conditions.append(f"{name} ({_format_fact(condition)})")
-    texts["conditions"] = "; ".join(conditions)
-    measures = [" in ".join(filter(None, split_unit(name))) for name in facts["measures"]]
-    texts["measures"] = ", ".join(measures)
-    first_parts = [text.format(texts[key]) for key, text in _METHODS if texts.get(key)]
-    sentences = [
-        f"{''.join(first_parts)} over the trials of a condition",
-        texts.get("completion"),
-        texts.get("answers"),
-    ]
-    sentences += _describe_computed(frozenset(facts.get("computed", ())), texts)
-    text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
-    # The templates are in the plural.
-    singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
-    return singular.replace("; 1 more were excluded", "; 1 more was excluded")
-
-
-def _check_facts(facts: Mapping[str, Any]) -> None:
-    """Checks that the facts of a methods paragraph are known and complete.
-
-    A misspelt fact would otherwise be missing in the paper without anybody noticing.
-
-    Raises:
-        UsageError: A fact is missing or unknown, or a condition has no delay.
-    """
-    known = [*(key for key, _ in _METHODS), *_ENDING]
-    missing = [key for key in known if key not in facts and key not in _OPTIONAL]
-    if missing:
-        raise UsageError(f"a methods paragraph needs {', '.join(missing)}")
-    unknown = [key for key in facts if key not in known]
-    if unknown:
-        raise UsageError(
-            f"unknown facts: {', '.join(unknown)}; the known facts are {', '.join(known)}"
-        )
-    unknown_analyses = [name for name in facts.get("computed", ()) if name not in COMPUTED]
-    if unknown_analyses:
-        raise UsageError(
-            f"unknown analyses: {', '.join(unknown_analyses)}; "
-            f"the known analyses are {', '.join(COMPUTED)}"
-        )
-    for name, condition in facts["conditions"].items():
-        if not any(key.startswith("delay") for key in condition):
-            raise UsageError(
-                f"condition {name} has no delay: "
-                "give the measured delay_ms, or 0 if there was no delay"
-            )
-
-
-def _describe_computed(computed: frozenset[str], texts: Mapping[str, str]) -> Iterator[str]:
-    """Yields a sentence of the methods paragraph for each analysis that was computed.
-
-    If the conditions were not compared by any test, a sentence says so.
-
-    Args:
-        computed: Names of the analyses that were computed, for example "t tests".
-        texts: Facts of the paragraph as texts, for example the correction of p.
-    """
-    correction = f"with p corrected by {texts['correction']} over all comparisons of a measure"
-    level = f", at alpha = {texts['alpha']}" if texts.get("alpha") else ""
-    if "t tests" in computed:
-        wilcoxon = ""
-        if "wilcoxon" in computed:
-            wilcoxon = " and by Wilcoxon's signed-rank test beside them"
-        tests = "conditions were compared by two-sided paired t tests"
-        yield f"{tests}, {correction}{level}{wilcoxon}"
-    if "sign tests" in computed:
-        rule = "in which a median that was not reached is longer than any that was reached"
-        by_sign = f"by exact two-sided sign tests on the medians, {rule}"
-        yield f"completion times were compared {by_sign}, {correction}{level}"
-    if "mixed models" in computed:
-        yield (
-            "forces of users were compared by mixed models, "
-            "with pair and user as random effects (REML)"
-        )
-    if computed.isdisjoint({"t tests", "sign tests", "mixed models"}):
-        yield "conditions were not compared by tests"
-    if "effect sizes" in computed:
-        yield "effect sizes are Cohen's d_z and d_av"
-    if "intervals" in computed:
-        bootstrap = ""
-        if "bootstrap" in computed:
-            bootstrap = f" and by the bootstrap (BCa, {RESAMPLES} resamples)"
-        yield f"intervals are of {100 * CONFIDENCE:g} %, by Student's t{bootstrap}"
-
-
-def _capitalise(sentence: str) -> str:
-    """Returns a sentence with a capital first letter. Other letters are unchanged."""
-    return sentence[0].upper() + sentence[1:]
-
-
-def _format_fact(value: Any, key: str = "") -> str:
-    """Returns a fact of the methods paragraph as text, with all digits of its numbers.
-
-    A number gets the unit at the end of its key: {"delay_ms": 50} becomes "delay 50 ms".
-    Several entries or items are joined by commas.
-
-    Args:
-        value: The fact: a number, a text, a mapping or a sequence.
-        key: Its name, whose ending states the unit.
-    """
-    if isinstance(value, str):
-        return value
-    if isinstance(value, Mapping):
-        items: list[str] = []
-        for name, item in value.items():
-            quantity, _ = split_unit(name)
-            items.append(f"{quantity} {_format_fact(item, name)}")
-        return ", ".join(items)
-    if isinstance(value, Sequence):
-        return ", ".join(_format_fact(item, key) for item in value)
-    number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
-    _, unit = split_unit(key)
-    return f"{number} {unit}".strip()

@@ -53,6 +53,19 @@ def test_short_text_has_verdicts_metrics_and_conclusion(logs: Path) -> None:
     assert f"--all prints all {len(names)} metrics" in brief[-1]
 
 
+def test_other_links_bring_the_undelayed_error(logs: Path) -> None:
+    """Only if links differ, the short text says how far sites are from where their peers are."""
+    facts = json.loads(trilat("compare", "a.mcap", "b.mcap", "--json", cwd=logs).succeeds())
+    (row,) = [row for row in facts["rows"] if row["key"] == "undelayed_max_rad"]
+    brief = trilat("compare", "a.mcap", "b.mcap", cwd=logs).succeeds().splitlines()
+    assert any(line.strip().startswith(f"{row['name']}  ") for line in brief)
+    first, second = row["values"]
+    clause = f"delay included, a site is at most {first:.3g} rad in a and {second:.3g} rad in b"
+    assert clause in brief[-2]
+    other_law = trilat("compare", "a.mcap", "hang.mcap", cwd=logs).succeeds()
+    assert "delay included" not in other_law
+
+
 @pytest.mark.long
 def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
     output = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()

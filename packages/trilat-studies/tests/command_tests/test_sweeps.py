@@ -1,4 +1,4 @@
-"""`trilat sweep` with `--map`, `--margin`, `--confirm`: output, files and refusals."""
+"""`trilat sweep` with `--map`, `--margin`, `--cell`: output, files and refusals."""
 
 import json
 import re
@@ -179,7 +179,6 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
         (("--resume", "none"), "this folder contains no sweep"),
         (("none.csv",), "no results of a sweep"),
         (("--over", "control.Kd=1,2"), "name a scenario"),
-        (("done", "--map", "--confirm", "1"), "--map and --confirm cannot be combined"),
         (("done", "--map", "--cell", "1"), "--map and --cell cannot be combined"),
         (("done", "--width", "7"), "--width sets the width of a map"),
         (
@@ -191,7 +190,7 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
             ("trio.toml", *OVER, "--tolerance", "0.1"),
             "--tolerance sets the tolerance of a stability limit",
         ),
-        (("trio.toml", *OVER, "--confirm", "2"), "--confirm needs the results"),
+        (("done", "--confirm", "2"), "there is no --confirm any more"),
         (("trio.toml", *OVER, "--margin", "control.Kd=1:4"), "control.Kd: is swept twice"),
     ],
 )

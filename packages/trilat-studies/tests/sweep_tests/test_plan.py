@@ -156,7 +156,7 @@ def test_undecided_cells_may_run_eight_times_as_long(tmp_path: Path) -> None:
         (["sites.q.rate_hz=1,2"], ("no such site", "m1, m2, s")),
         (["links.m1-s.delay_ms=1,2"], ("did you mean 'm1->s'?",)),
         (["link.order=newest,in_ordr"], ("'in_ordr'", "'newest' or 'in_order'")),
-        (["control.d=-1:1:0.5"], ("d[0]", ">= 0")),
+        (["control.d=-1:1:0.5"], ("control.d: expected", ">= 0")),
         (
             ["sites.s.environment.0.stiffness_n_m=1,2"],
             ("sites.s.environment.0: there is no such entry",),

@@ -6,15 +6,17 @@ depend on the gains that the sweep did not vary, so reports and figures of a swe
 
 Invariant:
     - A gain is named unless an axis of the sweep changes it at every site, which is the process
-      that runs one arm.
+      that runs one arm. The defaults of a user's law are named too.
 """
 
+import ast
 from collections.abc import Iterator
 from typing import Any
 
 import msgspec
 
-from trilat_net.own_code import ImportedLaw
+from trilat_net.errors import ScenarioError
+from trilat_net.own_code import ImportedLaw, read_code
 from trilat_net.scenario import Scenario, describe_value, identify_law
 
 from .sweep_plan import SweepPlan
@@ -70,7 +72,10 @@ def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
         site: Name of the site.
         law: Control law of the site.
     """
-    settings = law.settings if isinstance(law, ImportedLaw) else msgspec.to_builtins(law)
+    if isinstance(law, ImportedLaw):
+        settings = _read_default_settings(law) | law.settings
+    else:
+        settings = msgspec.to_builtins(law)
     swept_keys = {axis.key for axis in plan.axes}
     for key, value in settings.items():
         common_key = f"control.{key}"
@@ -78,3 +83,59 @@ def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
         is_swept = common_key in swept_keys or site_key in swept_keys
         if key != "law" and not is_swept:
             yield f"{key} {describe_value(value)}"
+
+
+def _read_default_settings(law: ImportedLaw) -> dict[str, Any]:
+    """Returns the defaults of the arguments of a user's law, which the scenario does not state.
+
+    They are read from the file of the law, which is not run. Defaults that are not written out
+    as literals are given as their Python text.
+
+    Args:
+        law: The law.
+
+    Returns:
+        Defaults by the name of the argument. Empty if the file is missing, has changed since
+        the sweep was planned, or does not define the arguments.
+    """
+    try:
+        source = read_code(law.code, "control.law")
+    except ScenarioError:
+        return {}
+    if source.sha256 != law.source_sha256:
+        return {}
+    tree = ast.parse(source.content)
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    kind = classes.get(law.code.partition(":")[2])
+    while kind is not None:
+        for member in kind.body:
+            if isinstance(member, ast.FunctionDef) and member.name == "__init__":
+                return _list_defaults(member.args)
+        # The class may have the arguments of a base class, which stands before it in the file.
+        bases = [base.id for base in kind.bases if isinstance(base, ast.Name)]
+        kind = classes.pop(bases[0], None) if bases else None
+    return {}
+
+
+def _list_defaults(arguments: ast.arguments) -> dict[str, Any]:
+    """Returns the defaults of a function's arguments, by name.
+
+    Args:
+        arguments: The arguments, as Python's parser returns them.
+    """
+    positional = [*arguments.posonlyargs, *arguments.args]
+    # Only the last of the positional arguments have defaults.
+    first = len(positional) - len(arguments.defaults)
+    pairs = [
+        *zip(positional[first:], arguments.defaults, strict=True),
+        *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
+    ]
+    defaults = {}
+    for argument, value in pairs:
+        if value is None:  # an argument without a default
+            continue
+        try:
+            defaults[argument.arg] = ast.literal_eval(value)
+        except ValueError:
+            defaults[argument.arg] = ast.unparse(value)
+    return defaults

@@ -1,8 +1,8 @@
 """Writes the sentences about the premises of a stability certificate.
 
-A premise is a condition of the stability theorem, such as constant delays. `premises` computes
-its quantities, and the functions in `DESCRIBERS` state them for people. A site is the process
-that runs one arm.
+A premise is a condition of the stability theorem, such as constant delays. The package
+`analysis` computes its quantities, and the functions in `DESCRIBERS` state them for people. A
+site is the process that runs one arm.
 
 Invariant:
     - A sentence lists at most `MAX_LISTED_NAMES` sites, links or joints, and counts the others.
@@ -12,49 +12,60 @@ Invariant:
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ...errors import count_nouns
-from .premise_quantities import (
-    AxisQuantities,
-    BookedTorqueQuantities,
-    BooksQuantities,
-    DelayQuantities,
-    DominanceQuantities,
-    FollowingQuantities,
-    FunctionalObstacle,
-    GainQuantities,
-    LawQuantities,
-    MissingFunctional,
-    OperatorQuantities,
-    ParameterFault,
-    ParameterQuantities,
-    PresenceQuantities,
-    PresentStretch,
-    RecordQuantities,
-    SamplingQuantities,
-    SingularPoseQuantities,
-    StopQuantities,
-    TorqueQuantities,
-    WallQuantities,
-)
+from ..analysis import find_missing_functionals, premise_quantities
+from ..errors import count_nouns
+from ..scenario import Scenario
 
 MAX_LISTED_NAMES = 4
 """Largest number of links or sites that a sentence names."""
 _OBSTACLES = {
-    FunctionalObstacle.UNKNOWN_PARAMETERS: "theta of the arm is unknown, and V depends on it",
-    FunctionalObstacle.LAW: "law {law} has no functional V",
-    FunctionalObstacle.ORIENTATIONS: (
+    premise_quantities.FunctionalObstacle.UNKNOWN_PARAMETERS: (
+        "theta of the arm is unknown, and V depends on it"
+    ),
+    premise_quantities.FunctionalObstacle.LAW: "law {law} has no functional V",
+    premise_quantities.FunctionalObstacle.ORIENTATIONS: (
         "the arm follows orientations, for which ed is not the derivative of e, "
         "so dV/dt has terms of either sign"
     ),
 }
 _PARAMETER_FAULTS = {
-    ParameterFault.OUTSIDE_BOX: "theta is outside the box in which the law keeps its estimates",
-    ParameterFault.NEVER_LEARNT: "a parameter is neither learnt nor known",
-    ParameterFault.FRICTION: "the law does not compensate all friction of the joints",
+    premise_quantities.ParameterFault.OUTSIDE_BOX: (
+        "theta is outside the box in which the law keeps its estimates"
+    ),
+    premise_quantities.ParameterFault.NEVER_LEARNT: "a parameter is neither learnt nor known",
+    premise_quantities.ParameterFault.FRICTION: (
+        "the law does not compensate all friction of the joints"
+    ),
 }
 
 
-def describe_missing_functionals(missing: Sequence[MissingFunctional]) -> str:
+def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str:
+    """Returns what the log of a run shows about a premise, as a sentence.
+
+    Args:
+        quantities: What was found about the premise.
+    """
+    return DESCRIBERS[type(quantities)](quantities)
+
+
+def explain_no_functional(scenario: Scenario) -> str:
+    """Explains for which arms the energy function V of the stability proof does not exist.
+
+    A certificate then judges the run without V.
+
+    Args:
+        scenario: The description of the experiment.
+
+    Returns:
+        The names of these arms' sites and the reasons, separated by semicolons. Empty if the
+        energy exists for every arm.
+    """
+    return describe_missing_functionals(find_missing_functionals(scenario))
+
+
+def describe_missing_functionals(
+    missing: Sequence[premise_quantities.MissingFunctional],
+) -> str:
     """Explains for which arms the energy function of the stability proof does not exist.
 
     Args:
@@ -86,13 +97,13 @@ def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
     )
 
 
-def _describe_law(quantities: LawQuantities) -> str:
+def _describe_law(quantities: premise_quantities.LawQuantities) -> str:
     if quantities.missing:
         return describe_missing_functionals(quantities.missing)
     return "adaptive at every site, of arms whose theta is known"
 
 
-def _describe_parameters(quantities: ParameterQuantities) -> str:
+def _describe_parameters(quantities: premise_quantities.ParameterQuantities) -> str:
     if not quantities.faults:
         return "every parameter is learnt or known, and no box excludes it"
     return _join_limited(
@@ -100,7 +111,7 @@ def _describe_parameters(quantities: ParameterQuantities) -> str:
     )
 
 
-def _describe_gains(quantities: GainQuantities) -> str:
+def _describe_gains(quantities: premise_quantities.GainQuantities) -> str:
     if quantities.scales is None:
         rows = []
         for site, gains in quantities.Kd.items():
@@ -114,7 +125,7 @@ def _describe_gains(quantities: GainQuantities) -> str:
     return f"one Kd up to a scalar: {_format_by_site(quantities.scales)}"
 
 
-def _describe_walls(quantities: WallQuantities) -> str:
+def _describe_walls(quantities: premise_quantities.WallQuantities) -> str:
     if not quantities.walls:
         return "no sampled wall was touched"
     summary = "every sampled wall is passive"
@@ -129,7 +140,7 @@ def _describe_walls(quantities: WallQuantities) -> str:
     return f"{summary}: {'; '.join(texts)}"
 
 
-def _describe_dominance(quantities: DominanceQuantities) -> str:
+def _describe_dominance(quantities: premise_quantities.DominanceQuantities) -> str:
     if quantities.changing:
         text = f"the shares of {_join_limited(quantities.changing)} change"
         losses = [
@@ -154,7 +165,7 @@ def _describe_dominance(quantities: DominanceQuantities) -> str:
     return text
 
 
-def _describe_delays(quantities: DelayQuantities) -> str:
+def _describe_delays(quantities: premise_quantities.DelayQuantities) -> str:
     if quantities.varying:
         ages = [
             f"{link.peer}->{link.site} "
@@ -168,7 +179,7 @@ def _describe_delays(quantities: DelayQuantities) -> str:
     return f"constant on every link: {', '.join(sorted(delays))}"
 
 
-def _describe_following(quantities: FollowingQuantities) -> str:
+def _describe_following(quantities: premise_quantities.FollowingQuantities) -> str:
     texts = [
         f"{site} {from_s:.4g} to {to_s:.4g} s"
         for site, from_s, to_s in quantities.interruptions
@@ -182,7 +193,7 @@ def _describe_following(quantities: FollowingQuantities) -> str:
     return f"{modes}: {_join_limited(texts)}"
 
 
-def _describe_torques(quantities: TorqueQuantities) -> str:
+def _describe_torques(quantities: premise_quantities.TorqueQuantities) -> str:
     if not quantities.cut:
         return "never cut off"
     texts = [
@@ -192,7 +203,7 @@ def _describe_torques(quantities: TorqueQuantities) -> str:
     return f"cut off: {_join_limited(texts)}"
 
 
-def _describe_stops(quantities: StopQuantities) -> str:
+def _describe_stops(quantities: premise_quantities.StopQuantities) -> str:
     if not quantities.touched:
         return "no stop is touched"
     texts = [
@@ -207,7 +218,7 @@ def _name_joints(joints: Sequence[str]) -> str:
     return f" ({_join_limited(joints)})" if joints else ""
 
 
-def _describe_axes(quantities: AxisQuantities) -> str:
+def _describe_axes(quantities: premise_quantities.AxisQuantities) -> str:
     if not quantities.faults:
         return "every site follows along each axis along which it moves and is followed"
     return _join_limited(
@@ -218,7 +229,7 @@ def _describe_axes(quantities: AxisQuantities) -> str:
     )
 
 
-def _describe_singular_poses(quantities: SingularPoseQuantities) -> str:
+def _describe_singular_poses(quantities: premise_quantities.SingularPoseQuantities) -> str:
     if quantities.near_s:
         texts = [f"{site} from {from_s:.4g} s on" for site, from_s in quantities.near_s.items()]
         return f"a pose is so nearly singular that it is damped: {_join_limited(texts)}"
@@ -226,7 +237,7 @@ def _describe_singular_poses(quantities: SingularPoseQuantities) -> str:
     return f"no pose is near one; least singular value at least: {bounds}"
 
 
-def _describe_operators(quantities: OperatorQuantities) -> str:
+def _describe_operators(quantities: premise_quantities.OperatorQuantities) -> str:
     if quantities.unmeasured:
         return f"no record says who pushes the arm of {_join_limited(quantities.unmeasured)}"
     if quantities.weightless:
@@ -251,7 +262,7 @@ def _describe_operators(quantities: OperatorQuantities) -> str:
     return f"{text}, and push to the end: not passive with respect to r"
 
 
-def _describe_records(quantities: RecordQuantities) -> str:
+def _describe_records(quantities: premise_quantities.RecordQuantities) -> str:
     if quantities.unjudged_s:
         spans = [f"{from_s:.4g} to {to_s:.4g} s" for from_s, to_s in quantities.unjudged_s]
         return f"not judged: {_join_limited(spans)}: records are missing there"
@@ -259,7 +270,7 @@ def _describe_records(quantities: RecordQuantities) -> str:
     return text if quantities.is_whole else f"{text} while all sites were present"
 
 
-def _describe_presence(quantities: PresenceQuantities) -> str:
+def _describe_presence(quantities: premise_quantities.PresenceQuantities) -> str:
     spans = [f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in quantities.absent]
     stretches = "; ".join(map(_describe_stretch, quantities.stretches))
     return (
@@ -268,7 +279,7 @@ def _describe_presence(quantities: PresenceQuantities) -> str:
     )
 
 
-def _describe_stretch(stretch: PresentStretch) -> str:
+def _describe_stretch(stretch: premise_quantities.PresentStretch) -> str:
     span = f"{stretch.from_s:.4g} to {stretch.to_s:.4g} s"
     if stretch.follow_from_s is None:
         return f"{span} not all follow"
@@ -279,12 +290,12 @@ def _describe_stretch(stretch: PresentStretch) -> str:
     return f"{span} all follow from {stretch.follow_from_s:.4g} s on, {delays}"
 
 
-def _describe_books(quantities: BooksQuantities) -> str:
+def _describe_books(quantities: premise_quantities.BooksQuantities) -> str:
     sizes = f"{quantities.residual_j:.1e} J of {quantities.scale_j:.4g} J"
     return f"the books of {quantities.site}'s law close to {sizes}, and the others closer"
 
 
-def _describe_booked_torques(quantities: BookedTorqueQuantities) -> str:
+def _describe_booked_torques(quantities: premise_quantities.BookedTorqueQuantities) -> str:
     if quantities.unbooked:
         sites = ", ".join(quantities.unbooked)
         return f"cut off at {sites}: the law books another torque than the arm got"
@@ -293,29 +304,29 @@ def _describe_booked_torques(quantities: BookedTorqueQuantities) -> str:
     return "never cut off"
 
 
-def _describe_sampling(quantities: SamplingQuantities) -> str:
+def _describe_sampling(quantities: premise_quantities.SamplingQuantities) -> str:
     energy = f"up to {quantities.leak_j:.3g} J more than its law books"
     return f"the arm of {quantities.site} got {energy}, between ticks"
 
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {
-    LawQuantities: _describe_law,
-    ParameterQuantities: _describe_parameters,
-    GainQuantities: _describe_gains,
-    WallQuantities: _describe_walls,
-    DominanceQuantities: _describe_dominance,
-    DelayQuantities: _describe_delays,
-    FollowingQuantities: _describe_following,
-    TorqueQuantities: _describe_torques,
-    StopQuantities: _describe_stops,
-    AxisQuantities: _describe_axes,
-    SingularPoseQuantities: _describe_singular_poses,
-    OperatorQuantities: _describe_operators,
-    RecordQuantities: _describe_records,
-    PresenceQuantities: _describe_presence,
-    BooksQuantities: _describe_books,
-    BookedTorqueQuantities: _describe_booked_torques,
-    SamplingQuantities: _describe_sampling,
+    premise_quantities.LawQuantities: _describe_law,
+    premise_quantities.ParameterQuantities: _describe_parameters,
+    premise_quantities.GainQuantities: _describe_gains,
+    premise_quantities.WallQuantities: _describe_walls,
+    premise_quantities.DominanceQuantities: _describe_dominance,
+    premise_quantities.DelayQuantities: _describe_delays,
+    premise_quantities.FollowingQuantities: _describe_following,
+    premise_quantities.TorqueQuantities: _describe_torques,
+    premise_quantities.StopQuantities: _describe_stops,
+    premise_quantities.AxisQuantities: _describe_axes,
+    premise_quantities.SingularPoseQuantities: _describe_singular_poses,
+    premise_quantities.OperatorQuantities: _describe_operators,
+    premise_quantities.RecordQuantities: _describe_records,
+    premise_quantities.PresenceQuantities: _describe_presence,
+    premise_quantities.BooksQuantities: _describe_books,
+    premise_quantities.BookedTorqueQuantities: _describe_booked_torques,
+    premise_quantities.SamplingQuantities: _describe_sampling,
 }
 """For each class of quantities, the function that writes its sentence."""
 

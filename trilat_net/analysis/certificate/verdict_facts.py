@@ -1,0 +1,260 @@
+"""The facts from which a stability certificate judges the energy function V, without sentences.
+
+V is the energy function of the stability proof. A site is the process that runs one arm.
+`stability_certificate` finds the facts, and the package `presentation` writes the sentences
+about them.
+
+Invariant:
+    - The facts contain only names and numbers, no sentence.
+    - Each verdict has exactly one class of facts. An empty collection means that nothing of
+      this kind was found in the run.
+"""
+
+from enum import Enum, auto
+from typing import Any, NamedTuple
+
+from ...hooks import find_hook
+from ...log import Coverage, Integrity
+from .premise_quantities import MissingFunctional, PremiseQuantities
+
+
+class StabilityFinding(Enum):
+    """What the energy function V of the stability proof shows about a run.
+
+    The names of the members, in small letters, are the values of `verdict` in the JSON output.
+    """
+
+    COVERED = auto()
+    """All premises of the theorem hold and V did not rise, so that the run is stable by it."""
+    DID_NOT_RISE = auto()
+    """A premise of the theorem fails, and V did not rise."""
+    ROSE = auto()
+    """V rose without a supply of energy."""
+    BROKEN = auto()
+    """The energy balance does not close: the records contradict each other."""
+    NOT_JUDGED = auto()
+    """V cannot be judged."""
+
+
+class FunctionalRise(NamedTuple):
+    """The largest rise of the arms' total energy that nobody supplied from outside.
+
+    The energy is the function V of the stability proof, less the work of operators and
+    environments. It must not rise by itself.
+
+    Attributes:
+        from_s: Time of the minimum of V before the rise, in s.
+        at_s: Time of the highest V, in s.
+        amount: Size of the rise, in J.
+        causes: Energy that each source supplied during the rise, in J, largest first. Only
+            sources of more than 5 % of the rise are listed.
+    """
+
+    from_s: float
+    at_s: float
+    amount: float
+    causes: dict[str, float]
+
+
+class UnsuppliedGrowth(NamedTuple):
+    """A growth of V that no operator and no environment supplied, at the end of a run.
+
+    Attributes:
+        energy_j: Size of the growth, in J.
+        from_s: Time from which V rises, in s. None if V is compared with its beginning.
+    """
+
+    energy_j: float
+    from_s: float | None = None
+
+
+class NoFunctional(NamedTuple):
+    """V does not exist for some arms.
+
+    Attributes:
+        missing: Sites of these arms, grouped by the reason.
+    """
+
+    missing: tuple[MissingFunctional, ...]
+
+
+class RecordGap(Enum):
+    """Reason why V cannot be computed although it exists: records are missing."""
+
+    NO_COMMON_TIME = auto()
+    """There is no time at which every site has records."""
+    NO_PERIOD = auto()
+    """There is no tick period whose records are complete."""
+
+
+class UnclosedBalance(NamedTuple):
+    """The energy balance of a site does not close.
+
+    Attributes:
+        site: Site with the largest error.
+        from_s: Time from which the energy does not add up, in s.
+        error_j: Largest error, in J.
+        scale_j: Largest energy of the run, in J.
+        external: External arms, if only these are concerned. Empty if the site is simulated.
+        is_certain: True if the records are certainly false. Otherwise a tick period that is
+            too long for the gains may be the cause.
+    """
+
+    site: str
+    from_s: float
+    error_j: float
+    scale_j: float
+    external: tuple[str, ...]
+    is_certain: bool
+
+
+class WrongTorque(NamedTuple):
+    """Recorded torques of a site differ from its control law, Eq. (13).
+
+    Attributes:
+        site: Name of the site.
+        from_s: Time from which they differ, in s.
+        error_nm: Largest difference, in N m.
+    """
+
+    site: str
+    from_s: float
+    error_nm: float
+
+
+class AmbiguousWeights(NamedTuple):
+    """The weights beta of the sites in V are not unique.
+
+    Attributes:
+        groups: Names of the sites in each closed group, which follows nobody outside.
+    """
+
+    groups: tuple[tuple[str, ...], ...]
+
+
+class CoarseEnergies(NamedTuple):
+    """The energies are not known precisely enough to decide whether V rose.
+
+    Attributes:
+        tolerance_j: Size that a rise must exceed to count, in J.
+        scale_j: Largest energy of the run, in J.
+    """
+
+    tolerance_j: float
+    scale_j: float
+
+
+class FunctionalCourse(NamedTuple):
+    """The course of V over a run in which it can be judged.
+
+    Attributes:
+        failed: Names of the premises that fail. The theorem does not apply if there are any.
+        undecided: Quantities of the premises that the log does not decide.
+        external: Names of operators and environments that did work, as in "hands".
+        from_s: First time of V, in s.
+        to_s: Last time of V, in s.
+        first_j: V at the first time, in J. 0 if V is a rounding error.
+        last_j: V at the last time, in J. 0 if V is a rounding error.
+        largest_j: Largest V, in J.
+        rise: Largest rise of V that nobody supplied. None if V did not rise.
+    """
+
+    failed: tuple[str, ...]
+    undecided: tuple[PremiseQuantities, ...]
+    external: tuple[str, ...]
+    from_s: float
+    to_s: float
+    first_j: float
+    last_j: float
+    largest_j: float
+    rise: FunctionalRise | None
+
+
+VerdictFacts = (
+    NoFunctional
+    | RecordGap
+    | UnclosedBalance
+    | WrongTorque
+    | AmbiguousWeights
+    | CoarseEnergies
+    | FunctionalCourse
+)
+"""The facts of any verdict."""
+
+
+class StabilityVerdict(NamedTuple):
+    """What the energy function V of the stability proof shows about a run.
+
+    Attributes:
+        finding: The finding, such as that V never rose.
+        facts: The numbers behind the finding.
+        rise: The largest rise of V beyond the tolerance. None if V did not rise.
+        tolerance: Size that a rise must exceed to count, in J.
+    """
+
+    finding: StabilityFinding
+    facts: VerdictFacts
+    rise: FunctionalRise | None = None
+    tolerance: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """The finding as a sentence for people, which the package `presentation` writes."""
+        return str(find_hook("describe a verdict")(self))
+
+
+class Evidence(NamedTuple):
+    """The records on which a stability certificate is based, and whether they suffice.
+
+    A site is the process that runs one arm, and stores a record in every tick of its control
+    loop.
+
+    Attributes:
+        coverage: Recorded ticks and expected ticks of every site.
+        functional_share: Fraction of the tick periods in which the energy of the stability
+            proof is known from records. Periods in which a site was absent do not count. None
+            if this energy is not judged.
+        min_coverage: Least fraction that suffices, for the ticks and for the periods.
+        integrity: Whether the log is unchanged since it was written.
+        unmet: Sites that did not react to the other sites, because their motion was copied from
+            an earlier run when the run was repeated.
+    """
+
+    coverage: Coverage
+    functional_share: float | None
+    min_coverage: float
+    integrity: Integrity
+    unmet: tuple[str, ...] = ()
+
+    @property
+    def reasons(self) -> list[str]:
+        """Sentences that say why the records do not suffice to judge the run.
+
+        Examples are a log that was changed after the run, or too many missing records. A run
+        with such a reason is not called stable. Empty if the records suffice.
+        """
+        return list(find_hook("doubt evidence")(self))
+
+    @property
+    def text(self) -> str:
+        """A sentence for the user: how many records exist, and whether the log is unchanged.
+
+        The certificate prints this sentence for every run, also if the records suffice.
+        """
+        return str(find_hook("describe evidence")(self))
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the extent and authenticity of the records as plain values.
+
+        The keys are those of `trilat certify --json`. For example, "coverage" is the smallest
+        share of a site's ticks that have a record, from 0 to 1, and "integrity" states whether
+        the log is unchanged.
+        """
+        return {
+            "coverage": self.coverage.share,
+            "functional_coverage": self.functional_share,
+            "min_coverage": self.min_coverage,
+            "judged": self.coverage.to_json(),
+            "integrity": self.integrity.state.name.lower(),
+            "open_loop_sites": list(self.unmet),
+        }

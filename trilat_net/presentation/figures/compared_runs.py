@@ -1,0 +1,181 @@
+"""Draws a signal of several runs over one another, with a panel per site and joint.
+
+A site is a process that runs one arm. The colour of a line is that of its site, and the dashes
+tell the runs apart: the first run is solid. The legend names the settings in which the runs
+differ.
+
+Invariant:
+    - A panel has one line for each run that has the site and the joint.
+"""
+
+import textwrap
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from ...analysis import recorded_end_s, site_signals
+from ...core import Array
+from ...errors import UsageError, count_nouns
+from ...log import Log, SiteLog
+from ...scenario import compare_scenarios
+from .. import plot_signals, style
+from ..appearance import REPORT_SIZE, FigureSize
+from .joint_motion import add_joint_rows, choose_height_in
+
+_MOST_SETTINGS = 3
+"""Largest number of differing settings that the legend names for each run."""
+_FIRST_ALPHA = 0.45
+"""Opacity of the lines of the first run."""
+_LETTERS_PER_IN = 15.0
+"""Average number of letters of the legend per inch."""
+
+
+class _ComparedSignal(NamedTuple):
+    """A signal of the sites that can be drawn for several runs.
+
+    Attributes:
+        name: Name for the labels of the value axes.
+        find_unit: Function that returns the unit of the signal in a log.
+        compute: Function that returns the signal of a site, shape (K, n).
+        shares_poses: True if the columns are what the sites exchange: in task space axes of the
+            end effectors in place of joints.
+    """
+
+    name: str
+    find_unit: Callable[[Log], str]
+    compute: Callable[[SiteLog], Array]
+    shares_poses: bool = False
+
+
+COMPARED_SIGNALS = {
+    "positions": _ComparedSignal("angle", lambda _: "rad", site_signals.joint_angles),
+    "tracking_errors": _ComparedSignal(
+        "error", plot_signals.shared_unit, site_signals.joint_errors, shares_poses=True
+    ),
+    "control_torques": _ComparedSignal(
+        "torque", lambda _: "N m", site_signals.controller_torques
+    ),
+}
+"""Signals that `draw_compared_runs` draws, by the names of the figures of one run."""
+
+
+def draw_compared_runs(
+    logs: Mapping[str, Log], name: str, form: FigureSize = REPORT_SIZE
+) -> Figure:
+    """Draws a signal of several runs over time, with a panel per site and joint.
+
+    Args:
+        logs: Logs of the runs, by their names in the legend.
+        name: Name of the signal, one of `COMPARED_SIGNALS`.
+        form: Width, type sizes and resolution of the figure.
+
+    Raises:
+        UsageError: There are too many runs for the patterns of dashes, or the runs have no
+            site in common.
+    """
+    if len(logs) > len(style.DASHES):
+        raise UsageError(
+            f"{name} can be drawn for at most {count_nouns(len(style.DASHES), 'run')}, "
+            f"not {len(logs)}; "
+            "overlay can be drawn for more"
+        )
+    sites = list_common_sites(logs)
+    if not sites:
+        raise UsageError(f"{name}: the logs have no site in common")
+    signal = COMPARED_SIGNALS[name]
+    first_log = next(iter(logs.values()))
+    titles = style.name_shared(first_log) if signal.shares_poses else []
+    unit = signal.find_unit(first_log)
+    # A narrow figure has no room for a label in one line.
+    gap = "\n" if form.narrow else " "
+    labels = [f"{signal.name}{gap}of {site} ({unit})" for site in sites]
+    row_in = 0.95 if form.narrow else 1.25
+    height_in = choose_height_in(first_log, 0.9 + row_in * len(sites))
+    end_s = max(recorded_end_s(log) for log in logs.values())
+    lines = [_style_run(number, form) for number in range(len(logs))]
+    with style.styled_figure(form, height_in) as figure:
+        grid, lowest = add_joint_rows(
+            figure=figure,
+            log=first_log,
+            form=form,
+            heads=labels,
+            labels=labels,
+            sharey="col",
+            titles=titles,
+        )
+        for site, row in zip(sites, grid, strict=True):
+            colour = style.site_colour(first_log, site)
+            for log, run_line in zip(logs.values(), lines, strict=True):
+                records = log[site]
+                line = {"color": colour, **run_line}
+                for axes, values in zip(row, signal.compute(records).T, strict=False):
+                    style.plot_decimated(axes, records.tick, records.t_s, values, **line)
+        for axes in lowest:
+            axes.set_xlabel("time (s)")
+            axes.set_xlim(0.0, end_s)
+        entries: list[style.LegendEntry] = []
+        for site in sites:
+            colour = style.site_colour(first_log, site)
+            entries.append((style.site_title(first_log, site), {"color": colour}))
+        for label, run_line in zip(label_runs(logs, form).values(), lines, strict=True):
+            entries.append((label, {"color": style.REFERENCE, **run_line}))
+        style.add_legend(figure, entries)
+    return figure
+
+
+def _style_run(number: int, form: FigureSize) -> style.LineOptions:
+    """Returns the options of the lines of a run, without their colour.
+
+    The first run is solid, wide and pale, so that dashed lines on it stay visible.
+
+    Args:
+        number: Number of the run, from 0.
+        form: Size of the figure.
+    """
+    line = {"linestyle": style.DASHES[number], "linewidth": 0.8 if form.narrow else 1.0}
+    if number == 0:
+        line |= {"linewidth": 1.6 if form.narrow else 2.0, "alpha": _FIRST_ALPHA}
+    return line
+
+
+def list_common_sites(logs: Mapping[str, Log]) -> list[str]:
+    """Lists the sites that all logs have, in the order of the first log.
+
+    Args:
+        logs: The logs, by their names.
+    """
+    first_log, *others = logs.values()
+    return [site for site in first_log.sites if all(site in log.sites for log in others)]
+
+
+def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
+    """Returns the text of each run in a legend: its name, and its differing settings.
+
+    An example is "slow: control.Kd = 3, every link 800 ms".
+
+    Args:
+        logs: Logs of the runs, by their names.
+        form: Size of the figure, whose width limits the length of a line.
+    """
+    scenarios = [log.scenario for log in logs.values()]
+    differences = compare_scenarios(scenarios) if len(scenarios) > 1 else []
+    first_scenario = scenarios[0]
+    letters = round(_LETTERS_PER_IN * form.width_in)
+    labels = {}
+    for number, name in enumerate(logs):
+        settings = []
+        for difference in differences[:_MOST_SETTINGS]:
+            value = difference.values[number]
+            if difference.concerns_link:
+                settings.append(f"{difference} {value}")
+            elif len(difference.owners) == len(first_scenario.sites):
+                settings.append(f"{difference.key} = {value}")
+            else:
+                settings.append(f"{difference} = {value}")
+        if len(differences) > _MOST_SETTINGS:
+            more = len(differences) - _MOST_SETTINGS
+            settings.append(f"and {count_nouns(more, 'more setting')}")
+        text = f"{name}: {', '.join(settings)}" if settings else name
+        labels[name] = style.typeset("\n".join(textwrap.wrap(text, letters)))
+    return labels
