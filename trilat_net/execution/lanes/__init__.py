@@ -2,6 +2,6 @@
 
 from .lane_rows import LANES
 from .lane_structure import find_obstacle
-from .run_groups import LEAST_RUNS, RunGroup, group_runs
+from .run_groups import LEAST_RUNS, RunGroup, group_runs, prepare_lanes
 
-__all__ = ["LANES", "LEAST_RUNS", "RunGroup", "find_obstacle", "group_runs"]
+__all__ = ["LANES", "LEAST_RUNS", "RunGroup", "find_obstacle", "group_runs", "prepare_lanes"]

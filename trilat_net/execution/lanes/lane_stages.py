@@ -35,9 +35,9 @@ from ...core.step.kernel import (
 )
 from ...core.step.site_setup import Law
 from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import Array, IntArray, Pair, Vector, five, pair, put_pair
+from ...core.step.vectors import Array, IntArray, Vector, five, pair, put_pair
 from .lane_laws import compute_law
-from .lane_rows import Words, in_lane, pointer_to, select_row
+from .lane_rows import Words, in_lane, number_of, pointer_to, select_row
 
 _DIVERGED = int(Mode.DIVERGED)
 _USER = int(Law.USER)
@@ -108,11 +108,11 @@ def _advance_stage(
     t_s: float,
     ahead_s: float,
     s: Any,
-    qd_before: Pair,
-    qdd_before: Pair,
+    qd_before: Vector,
+    qdd_before: Vector,
     actors: Any,
     table: TorqueTable,
-) -> tuple[Pair, Pair]:
+) -> Any:
     """Evaluates a stage of the integrator, see `two_link_stages.advance_stage`.
 
     Args:
@@ -142,8 +142,8 @@ def _advance_stage(
 
 @lane_leaf
 def advance_site(
-    k: int,
-    t_ns: int,
+    k: Any,
+    t_ns: Any,
     lanes: int,
     settled_rad: float,
     i: int,
@@ -176,8 +176,8 @@ def advance_site(
     All tables have a lane for each run. No two of them overlap in memory.
 
     Args:
-        k: The tick.
-        t_ns: Its nominal time, ns since the epoch.
+        k: The tick, of all lanes or of each lane, see `number_of`.
+        t_ns: Its nominal time, ns since the epoch, of all lanes or of each lane.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
@@ -211,13 +211,14 @@ def advance_site(
         rows = in_lane(links, lane)
         for p in range(rows.shape[0]):
             link = rows[p]
+            lane_ns = number_of(t_ns, lane)
             sample = used[p, lane, block_row]
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
             if in_lane(site, lane)[0].law == _USER:
                 link.new = sample > link.used
-                link.used_ns = t_ns if sample > link.used else link.used_ns
+                link.used_ns = lane_ns if sample > link.used else link.used_ns
             link.used = sample
             for c in range(JOINTS):
                 link.q[c] = states[peer, page, lane, c]
@@ -238,8 +239,8 @@ def advance_site(
     # 3 reference, 4 errors, 5 estimate
     for lane in range(lanes):
         reference_stages(
-            k=k,
-            t_ns=t_ns,
+            k=number_of(k, lane),
+            t_ns=number_of(t_ns, lane),
             site=in_lane(site, lane),
             links=in_lane(links, lane),
             ramps=in_lane(ramps, lane)[0].rows,
@@ -254,8 +255,8 @@ def advance_site(
     for lane in range(lanes):
         compute_law(
             code,
-            k,
-            t_ns,
+            number_of(k, lane),
+            number_of(t_ns, lane),
             in_lane(site, lane),
             in_lane(links, lane),
             in_lane(law, lane),
@@ -266,8 +267,14 @@ def advance_site(
     # 6 limits of the torque, 7 emit
     for lane in range(lanes):
         floats = in_lane(record, lane)[record_row].floats
-        emit_stages(k=k, t_ns=t_ns, s=in_lane(site, lane)[0], chain=None, record=floats)
-        page = k & (pages - 1)
+        emit_stages(
+            k=number_of(k, lane),
+            t_ns=number_of(t_ns, lane),
+            s=in_lane(site, lane)[0],
+            chain=None,
+            record=floats,
+        )
+        page = number_of(k, lane) & (pages - 1)
         for c in range(JOINTS):
             states[i, page, lane, c] = floats[c]
             states[i, page, lane, JOINTS + c] = floats[JOINTS + c]
@@ -278,18 +285,17 @@ def advance_site(
             number = in_lane(sent, lane)[0].numbers[c]
             floats = in_lane(record, lane)[record_row].floats
             floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
-            states[i, k & (pages - 1), lane, 3 * JOINTS + c] = number
+            states[i, number_of(k, lane) & (pages - 1), lane, 3 * JOINTS + c] = number
 
     # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
     # processor begins with the next lanes while it waits for results of the previous ones.
-    t_s = t_ns * 1e-9
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         if s.mode != _DIVERGED:
-            hold_motor_torque(k, s)
+            hold_motor_torque(number_of(k, lane), s)
         stages = in_lane(scratch, lane)[0]
         qdd = two_link_stages.find_stage_acceleration(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             q=pair(s.q),
             qd=pair(s.qd),
             u=pair(s.u),
@@ -304,7 +310,7 @@ def advance_site(
         s = in_lane(site, lane)[0]
         stages = in_lane(scratch, lane)[0]
         qd, qdd = _advance_stage(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=0.5 * (1.0 / s.rate_hz),
             s=s,
             qd_before=pair(s.qd),
@@ -318,7 +324,7 @@ def advance_site(
         s = in_lane(site, lane)[0]
         stages = in_lane(scratch, lane)[0]
         qd, qdd = _advance_stage(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=0.5 * (1.0 / s.rate_hz),
             s=s,
             qd_before=pair(stages.qd_2),
@@ -333,7 +339,7 @@ def advance_site(
         stages = in_lane(scratch, lane)[0]
         h_s = 1.0 / s.rate_hz
         qd_4, qdd_4 = _advance_stage(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=h_s,
             s=s,
             qd_before=pair(stages.qd_3),
@@ -366,7 +372,7 @@ def advance_site(
         site_sums = in_lane(sums, lane)[0]
         update_peaks(
             row=floats,
-            t_ns=t_ns,
+            t_ns=number_of(t_ns, lane),
             settled_rad=settled_rad,
             s=s,
             progress=in_lane(progress, lane)[0],
@@ -374,8 +380,8 @@ def advance_site(
             sums=site_sums,
         )
         update_sums(
-            k=k,
-            t_ns=t_ns,
+            k=number_of(k, lane),
+            t_ns=number_of(t_ns, lane),
             s=s,
             chain=None,
             environments=in_lane(environments, lane),
@@ -395,6 +401,7 @@ class EndedRuns(NamedTuple):
         ticks: Number of ticks that each run has made, shape (LANES,). -1: the run has not
             ended.
         site_rows: Rows of the sites, shape (N, words of a row, LANES).
+        links: Rows of the links, shape (N P, words of a row, LANES).
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words of a row, LANES).
         progress: Rows of the progress, shape (N, words of a row, LANES).
@@ -405,6 +412,7 @@ class EndedRuns(NamedTuple):
 
     ticks: IntArray
     site_rows: Words
+    links: Words
     records: Words
     sums: Words
     progress: Words
@@ -428,8 +436,8 @@ def _copy_lane(lane: int, source: Words, target: Words) -> None:
 
 
 @leaf
-def _keep_ended_runs(
-    ticks: int,
+def keep_ended_runs(
+    ticks: Any,
     runs: int,
     mode_word: int,
     bucket: int,
@@ -441,7 +449,7 @@ def _keep_ended_runs(
     """Keeps the numbers of runs of which an arm left its limits in the present tick.
 
     Args:
-        ticks: Number of ticks that the runs have made.
+        ticks: Number of ticks that the runs have made, of all runs or of each run.
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
         bucket: The present bucket.
@@ -464,8 +472,9 @@ def _keep_ended_runs(
         if not has_diverged:
             running += 1
             continue
-        ended.ticks[lane] = ticks
+        ended.ticks[lane] = number_of(ticks, lane)
         _copy_lane(lane, present.site_rows, ended.site_rows)
+        _copy_lane(lane, present.links, ended.links)
         _copy_lane(lane, present.records[:, record_row], ended.records)
         _copy_lane(lane, present.sums, ended.sums)
         _copy_lane(lane, present.progress, ended.progress)
@@ -473,6 +482,16 @@ def _keep_ended_runs(
         _copy_lane(lane, present.sent, ended.sent)
         _copy_lane(lane, peaks[:, bucket], ended.peaks)
     return running
+
+
+@leaf
+def count_lanes(runs: int) -> int:
+    """Returns the number of lanes that are computed for a number of runs.
+
+    They fill whole vector registers: the numbers of lanes without a run have no meaning. One or
+    two lanes more are faster without vectors.
+    """
+    return runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
 
 
 @leaf
@@ -522,9 +541,7 @@ def run_block(
         The number of runs that have not ended.
     """
     running = runs
-    # Whole vector registers: the numbers of lanes without a run have no meaning. One or two
-    # lanes more are faster without vectors.
-    lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
+    lanes = count_lanes(runs)
     for block_row in range(count):
         k = first + block_row
         t_ns = tick_ns(k, rate_hz)
@@ -564,7 +581,7 @@ def run_block(
                     table,
                 ),
             )
-        running = _keep_ended_runs(
+        running = keep_ended_runs(
             ticks=k + 1,
             runs=runs,
             mode_word=mode_word,

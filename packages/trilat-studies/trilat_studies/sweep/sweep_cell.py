@@ -14,10 +14,10 @@ Invariant:
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -26,7 +26,7 @@ from trilat_net.analysis.run_end import EndBehaviour, RunTrace, Stability, class
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
 from trilat_net.analysis.theory.loop_roots import find_run_roots
 from trilat_net.analysis.twins.twin_growth import measure_virtual_twins
-from trilat_net.execution.fused import FusedRun, RunTotals, check_fusable
+from trilat_net.execution.fused import FusedRun, check_fusable
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.scenario.validate import refuse_live_only
@@ -55,6 +55,10 @@ class CellClass(StrEnum):
         if self is CellClass.UNDECIDED:
             return None
         return self is CellClass.CONVERGED
+
+
+TOTAL_KEYS = ("rms_error_rad", "effort_nm", "force_peak_n", "walls_j")
+"""Fields of a result that summarise the whole run, see `RunTotals`."""
 
 
 def classify_decision(stability: Stability, behaviour: EndBehaviour) -> CellClass:
@@ -185,7 +189,7 @@ class _CellInProgress:
         Totals, such as the RMS error, are taken here, before any extension. A run that chatters
         at a wall is not extended, see `classify_cell`.
         """
-        self._totals = self.run.totals
+        self._totals = self.run.totals._asdict()
         self._outcome = self._build_result()
         if self._end_s < self._longest_s and _chatters(self._scenario, self.run):
             self._longest_s = self._end_s
@@ -420,14 +424,14 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 
 
 def _build_result(
-    run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int
+    run: FusedRun, scenario: Scenario, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
     """Returns the result of a run up to the time that the run has reached.
 
     Args:
         run: The run.
         scenario: Scenario of the run.
-        totals: Totals over the scenario's duration, without extensions.
+        totals: Totals over the scenario's duration, without extensions, see `RunTotals`.
         extended: Number of times that the duration was doubled.
     """
     end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
@@ -443,7 +447,7 @@ def _build_result(
         peak_error_rad=max(float(values[:, 0].max()) for values in run.maxima),
         settled_s=run.settled_s,
         diverged_s=end.diverged_at_s,
-        **totals._asdict(),
+        **totals,
         reasons="; ".join(end.reasons),
     )
 

@@ -30,14 +30,13 @@ import msgspec
 
 from trilat_net.analysis.metrics.log_metrics import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
-from trilat_net.execution.fused import RunTotals
 from trilat_net.files import write_whole
 from trilat_net.results import Result
 from trilat_net.scenario.scenario_reader import read_source
 from trilat_net.work.intervals import MeanInterval, mean_interval, wilson_interval
 from trilat_net.work.study_folder import encode_csv, format_command, set_options
 
-from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
+from .sweep_cell import TOTAL_KEYS, CellClass, CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan, plan_from_json
 
 RESULTS_FILE = "results.csv"
@@ -443,7 +442,7 @@ def list_totals(plan: SweepPlan) -> list[str]:
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
     """
-    keys = (*RunTotals._fields, *plan.metrics)
+    keys = (*TOTAL_KEYS, *plan.metrics)
     return list(dict.fromkeys(keys))
 
 

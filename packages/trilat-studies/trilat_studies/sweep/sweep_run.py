@@ -31,7 +31,6 @@ from trilat_net.errors import (
     count_nouns,
     format_wall_time,
 )
-from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net.clock import SystemClock
@@ -425,12 +424,10 @@ def _compile_lanes(plan: SweepPlan) -> None:
     Args:
         plan: The sweep. The code is that of its first cell.
     """
-    from trilat_net.execution.lanes import LEAST_RUNS, group_runs
+    from trilat_net.execution.lanes import prepare_lanes
 
     scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
-    runs = [FusedRun(scenario) for _ in range(LEAST_RUNS)]
-    for group in group_runs(runs):
-        group.advance_to(1.0 / max(spec.rate_hz for spec in plan.base.sites.values()))
+    prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
 
 
 def describe_runs_alone(finished: FinishedSweep) -> str:
