@@ -26,7 +26,7 @@ from ..fused import FusedRun
 from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
 from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
 from .lane_run import LaneRun, explain_uncompilable, put_rows, view_rows
-from .lane_stages import EndedRuns, count_lanes, keep_ended_runs
+from .lane_stages import EndedRuns, copy_lane, keep_ended_runs
 from .lane_structure import RunStructure, find_obstacle, find_structure
 from .run_groups import LEAST_RUNS
 
@@ -158,7 +158,7 @@ def _run_span(
         The number of runs that have not ended in this way.
     """
     running = runs
-    lanes = count_lanes(runs)
+    lanes = (runs + 7) // 8 * 8
     for block_row in range(count):
         for lane in range(LANES):
             k = first[lane] + block_row
@@ -212,6 +212,9 @@ def _run_span(
             present=present,
             ended=ended,
         )
+        for lane in range(runs):
+            if ended.ticks[lane] == clock[0, 0, lane]:
+                copy_lane(lane, present.links, ended.links)
     return running
 
 

@@ -401,7 +401,8 @@ class EndedRuns(NamedTuple):
         ticks: Number of ticks that each run has made, shape (LANES,). -1: the run has not
             ended.
         site_rows: Rows of the sites, shape (N, words of a row, LANES).
-        links: Rows of the links, shape (N P, words of a row, LANES).
+        links: Rows of the links, shape (N P, words of a row, LANES). Only `LaneEpisodes` keeps
+            them: in `keep_ended_runs` their copy makes all ticks slower by half.
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words of a row, LANES).
         progress: Rows of the progress, shape (N, words of a row, LANES).
@@ -422,7 +423,7 @@ class EndedRuns(NamedTuple):
 
 
 @leaf
-def _copy_lane(lane: int, source: Words, target: Words) -> None:
+def copy_lane(lane: int, source: Words, target: Words) -> None:
     """Copies the numbers of one lane.
 
     Args:
@@ -473,25 +474,14 @@ def keep_ended_runs(
             running += 1
             continue
         ended.ticks[lane] = number_of(ticks, lane)
-        _copy_lane(lane, present.site_rows, ended.site_rows)
-        _copy_lane(lane, present.links, ended.links)
-        _copy_lane(lane, present.records[:, record_row], ended.records)
-        _copy_lane(lane, present.sums, ended.sums)
-        _copy_lane(lane, present.progress, ended.progress)
-        _copy_lane(lane, present.laws, ended.laws)
-        _copy_lane(lane, present.sent, ended.sent)
-        _copy_lane(lane, peaks[:, bucket], ended.peaks)
+        copy_lane(lane, present.site_rows, ended.site_rows)
+        copy_lane(lane, present.records[:, record_row], ended.records)
+        copy_lane(lane, present.sums, ended.sums)
+        copy_lane(lane, present.progress, ended.progress)
+        copy_lane(lane, present.laws, ended.laws)
+        copy_lane(lane, present.sent, ended.sent)
+        copy_lane(lane, peaks[:, bucket], ended.peaks)
     return running
-
-
-@leaf
-def count_lanes(runs: int) -> int:
-    """Returns the number of lanes that are computed for a number of runs.
-
-    They fill whole vector registers: the numbers of lanes without a run have no meaning. One or
-    two lanes more are faster without vectors.
-    """
-    return runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
 
 
 @leaf
@@ -541,7 +531,9 @@ def run_block(
         The number of runs that have not ended.
     """
     running = runs
-    lanes = count_lanes(runs)
+    # Whole vector registers: the numbers of lanes without a run have no meaning. One or two
+    # lanes more are faster without vectors.
+    lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
     for block_row in range(count):
         k = first + block_row
         t_ns = tick_ns(k, rate_hz)
