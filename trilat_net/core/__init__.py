@@ -208,6 +208,7 @@ __all__ = [
     "BLEND_S",
     "HELD_OVERRUN_TICKS",
     "REST_RATE_1_S",
+    "SeveralHands",
     # Control laws of users
     "CHECKED",
     "MAX_RECORD_SENT",
@@ -299,6 +300,7 @@ if TYPE_CHECKING:
     from .life.resting import REST_RATE_1_S
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
+    from .life.several_hands import SeveralHands
     from .links import dominance
     from .links.channel import (
         LOST,
@@ -493,6 +495,7 @@ else:
             "life.resting": "REST_RATE_1_S",
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
+            "life.several_hands": "SeveralHands",
             "links.channel": (
                 "LOST advance_losses delay_sample find_delay_us find_due_ns loses_samples "
                 "schedule_deliveries select_model"

@@ -7,7 +7,6 @@ from ..hooks import import_on_use
 __all__ = [
     # Runs in virtual time
     "FusedRun",
-    "RunTotals",
     "SimulatedLog",
     "check_fusable",
     "check_virtual",
@@ -18,9 +17,11 @@ __all__ = [
     "simulate_scenario",
     "simulate_without_operators",
     # Runs side by side
+    "LaneEpisodes",
     "RunGroup",
     "describe_structure",
     "group_runs",
+    "prepare_lanes",
     # Execution of a log
     "LinkEffect",
     "LogCheckReport",
@@ -41,9 +42,10 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .fused import FusedRun, RunTotals, check_fusable, explain_not_repeatable
+    from .fused import FusedRun, check_fusable, explain_not_repeatable
+    from .lanes.lane_episodes import LaneEpisodes
     from .lanes.lane_structure import describe_structure
-    from .lanes.run_groups import RunGroup, group_runs
+    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
     from .log_checks import LogCheckReport, check_log_files
     from .rerun_execution import describe_rerun_changes
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
@@ -61,9 +63,10 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "fused": "FusedRun RunTotals check_fusable explain_not_repeatable",
+            "fused": "FusedRun check_fusable explain_not_repeatable",
+            "lanes.lane_episodes": "LaneEpisodes",
             "lanes.lane_structure": "describe_structure",
-            "lanes.run_groups": "RunGroup group_runs",
+            "lanes.run_groups": "RunGroup group_runs prepare_lanes",
             "log_checks": "LogCheckReport check_log_files",
             "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",

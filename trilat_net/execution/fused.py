@@ -535,7 +535,8 @@ class FusedRun:
             if next_pause_ns > last_ns:
                 break
             self._step_piece(next_pause_ns - 1)  # up to the last tick before the pause
-        self._step_piece(last_ns)
+        if self.diverged_s is None:
+            self._step_piece(last_ns)
         # The arms of plants move on by the last tick, as all other arms did within the loop.
         for i in self._plants:
             self._move_plant(i)
@@ -751,6 +752,11 @@ class FusedRun:
         be copied.
         """
         return bool(self._hands or self._plants)
+
+    @property
+    def programmed_sites(self) -> set[int]:
+        """Indices of the sites of these programs."""
+        return {*self._hands, *self._plants}
 
     def copy_state(self, other: "FusedRun") -> None:
         """Makes this run continue from exactly the same state as another run.

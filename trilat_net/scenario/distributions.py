@@ -149,6 +149,8 @@ class Draws:
                 entries.append(entry if is_nested else self._draw_entry(entry, f"{path}[{n}]"))
             return entries
 
+        if not self._known and not is_distribution(value):
+            return value
         key = dotted_key(path)
         known = self._known.get(key)
         if is_distribution(value):

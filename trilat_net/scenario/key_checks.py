@@ -11,7 +11,7 @@ Invariant:
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple, TypeGuard, get_type_hints
 
 import msgspec
@@ -89,6 +89,12 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
     return count_names
 
 
+@lru_cache(maxsize=256)
+def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
+    """Returns the fields of a table's type. msgspec itself evaluates its types in each call."""
+    return msgspec.structs.fields(kind)
+
+
 def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
     """Expands single numbers to vectors of the length that the arm needs.
 
@@ -108,7 +114,7 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
     for key, per in _vector_keys(kind, "per").items():
         lengths[key] = getattr(counts, per)
     expanded: TomlTable = {}
-    for field in msgspec.structs.fields(kind):
+    for field in list_fields(kind):
         name = field.name
         if name in lengths and isinstance(field.default, tuple):
             expanded[name] = [field.default[0]] * lengths[name]

@@ -53,6 +53,7 @@ from .key_checks import (
     find_count_problem,
     is_distribution,
     is_number,
+    list_fields,
 )
 from .laws import LAWS
 from .link_inertia import LinkInertia
@@ -1008,7 +1009,7 @@ def _complete_link(
         link = _read_trace_file(link, name, trace_path or path, folder)
     kind = DELAY_MODELS[link["model"]]
     link = {**kind.derive_keys(link), **link}
-    for field in msgspec.structs.fields(kind):
+    for field in list_fields(kind):
         if field.required and field.name not in link:
             advice = "; give it here or in [link]" if trace_path else ""
             raise ScenarioError(f"is missing{advice}", path=f"{path}.{field.name}")

@@ -747,10 +747,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         arm = self.arms[site]
         motion = spec.limits.motion
         start = np.array(spec.q0_rad)
+        if not np.any((start < motion.q_min) | (start > motion.q_max)):
+            return motion
         low = np.broadcast_to(motion.q_min, start.shape)
         high = np.broadcast_to(motion.q_max, start.shape)
-        if not np.any((start < low) | (start > high)):
-            return motion
         margin = np.full(start.shape, START_MARGIN_RAD)
         if arm.chain is not None:
             margin = np.array([start_margin(joint) for joint in arm.chain.joints])

@@ -353,6 +353,8 @@ class WorkerPool:
         function: Callable[[T], R],
         items: Sequence[T],
         progress: Progress = ignore_progress,
+        together: Together[T, R] | None = None,
+        together_count: int = 1,
     ) -> list[R]:
         """Runs a function on each item with all workers, and collects the results.
 
@@ -360,6 +362,8 @@ class WorkerPool:
             function: Function at module level, so that another process can import it.
             items: The items, each of which is the argument of one call.
             progress: Function that is called whenever an item has ended.
+            together: Function that replaces `function` for several items at once.
+            together_count: Number of items that `together` should get.
 
         Returns:
             The results in the order of the items. Empty if there are no items.
@@ -369,7 +373,13 @@ class WorkerPool:
             UsageError: A worker does not meet the requirements.
         """
         results: dict[int, R] = {}
-        for number, result in self.iterate_results(function, items, count=len(items)):
+        for number, result in self.iterate_results(
+            function,
+            items,
+            count=len(items),
+            together=together,
+            together_count=together_count,
+        ):
             results[number] = result
             progress(len(results), len(items))
         return [results[number] for number in range(len(items))]

@@ -66,6 +66,7 @@ def test_gymnasiums_checker_renders_as_well(flat: bool) -> None:
     check_env(environment.unwrapped)
 
 
+@pytest.mark.filterwarnings("ignore:the action")
 def test_an_episode_is_a_function_of_its_seed() -> None:
     env, other = (tn.make_env("paper", duration_s=2, vary=VARY) for _ in range(2))
     for seed in (1, 2, 1):
@@ -75,6 +76,7 @@ def test_an_episode_is_a_function_of_its_seed() -> None:
     assert episode(env, 1)[1] != episode(env, 2)[1]
 
 
+@pytest.mark.filterwarnings("ignore:the action")
 def test_the_vector_form_gives_the_same_bits() -> None:
     keys = {"scenario": "paper", "duration_s": 2, "vary": VARY}
     several = gymnasium.make_vec(ENV_ID, 2, "sync", **keys)
@@ -92,9 +94,10 @@ def test_the_vector_form_gives_the_same_bits() -> None:
     several.close()
 
 
+@pytest.mark.filterwarnings("ignore:the action")
 def test_a_saved_episode_is_a_log_that_verifies(tmp_path: Path) -> None:
     env = tn.make_env("paper", duration_s=1, vary=VARY)
-    with pytest.raises(UsageError, match="once it has a step"):
+    with pytest.raises(UsageError, match="before its first step"):
         env.save(tmp_path / "none.mcap")
     seen, _ = episode(env, 3)
     log = tn.open_log(env.save(tmp_path / "episode.mcap"))

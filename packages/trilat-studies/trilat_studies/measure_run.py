@@ -267,39 +267,68 @@ def run_compiled_in_batches(
     Returns:
         The finished run, with its final state and the time at which a site left its limits.
     """
-    run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
-    columns_of_site = {}
-    for name in scenario.names:
-        layout = scenario.layout(name)
-        columns_of_site[name] = layout.columns()
-    rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
-    fastest_hz = max(rates_hz)
-    # In this time no site produces more records than the run keeps.
-    period_s = BATCH_RECORDS / fastest_hz
-    no_columns = slice(0, 0)  # for vectors that the site does not have
-    while run.ran_s < scenario.duration_s and run.diverged_s is None:
-        end_s = min(run.ran_s + period_s, scenario.duration_s)
-        run.advance_to(end_s)
-        records_of_sites = run.pop_records()
-        for name, site_records in zip(scenario.names, records_of_sites, strict=True):
+    compiled = _CompiledRun(scenario, receivers)
+    run = compiled.run
+    while not compiled.is_finished:
+        run.advance_to(compiled.find_next_end())
+        compiled.pass_records()
+    return run
+
+
+class _CompiledRun:
+    """Run in the compiled loop whose records are passed on batch by batch.
+
+    Args:
+        scenario: Scenario to run.
+        receivers: For each site, the function that receives its batches.
+
+    Attributes:
+        run: The run, which the caller advances to `find_next_end`.
+    """
+
+    def __init__(
+        self, scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
+    ) -> None:
+        self.run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
+        self._scenario = scenario
+        self._receivers = receivers
+        self._columns = {name: scenario.layout(name).columns() for name in scenario.names}
+        self._axes = {name: arm.axes for name, arm in scenario.arms.items()}
+        fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
+        # In this time no site produces more records than the run keeps.
+        self._period_s = BATCH_RECORDS / fastest_hz
+
+    @property
+    def is_finished(self) -> bool:
+        """True if the run has its whole duration, or an arm has left its limits."""
+        run = self.run
+        return run.ran_s >= self._scenario.duration_s or run.diverged_s is not None
+
+    def find_next_end(self) -> float:
+        """Returns the end of the next batch, in s."""
+        return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
+
+    def pass_records(self) -> None:
+        """Passes the records since the last call to the receivers."""
+        no_columns = slice(0, 0)  # for vectors that the site does not have
+        records_of_sites = self.run.pop_records()
+        for name, site_records in zip(self._scenario.names, records_of_sites, strict=True):
             t_ns, rows = site_records
             if not len(t_ns):
                 continue
-            columns = columns_of_site[name]
+            columns = self._columns[name]
             vectors = []
             for key in _VECTORS:
                 vector_columns = columns.get(key, no_columns)
                 vectors.append(rows[:, vector_columns])
             no_samples = (len(t_ns), 0)
             used = np.zeros(no_samples, np.int64)
-            axes = scenario.arms[name].axes
-            batch = _build_batch(axes, t_ns, used, *vectors)
-            receive = receivers[name]
+            batch = _build_batch(self._axes[name], t_ns, used, *vectors)
+            receive = self._receivers[name]
             receive(batch)
-    return run
 
 
-class _WholeRun(NamedTuple):
+class WholeRun(NamedTuple):
     """A simulated run with all of its records.
 
     Attributes:
@@ -313,7 +342,7 @@ class _WholeRun(NamedTuple):
     run: FusedRun
 
 
-def run_whole(scenario: Scenario) -> _WholeRun:
+def run_whole(scenario: Scenario) -> WholeRun:
     """Runs a scenario in the compiled loop and keeps all records in memory.
 
     Args:
@@ -323,6 +352,57 @@ def run_whole(scenario: Scenario) -> _WholeRun:
     batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
     receivers = {name: batches[name].append for name in batches}
     run = run_compiled_in_batches(scenario, receivers)
+    return _join_run(scenario, run, batches)
+
+
+_RECORD_ROWS = 1 << BATCH_RECORDS.bit_length()
+"""Number of records that runs side by side keep, a power of two above `BATCH_RECORDS`."""
+
+
+def run_whole_together(
+    scenarios: Sequence[Scenario],
+) -> Iterator[tuple[int, WholeRun, str]]:
+    """Runs scenarios side by side where that is possible, and keeps all records in memory.
+
+    Args:
+        scenarios: The scenarios.
+
+    Yields:
+        The index of a scenario; its run, equal to that of `run_whole`; and the property because
+        of which it was computed alone, or an empty text. The order is that of groups of runs,
+        of which one is in memory at a time.
+    """
+    # A single run must not load the code of lanes.
+    from trilat_net.execution import group_runs
+
+    batches: list[dict[str, list[RecordBatch]]] = []
+    compiled = []
+    for scenario in scenarios:
+        batches.append({name: [] for name in scenario.names})
+        receivers = {name: records.append for name, records in batches[-1].items()}
+        compiled.append(_CompiledRun(scenario, receivers))
+    for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
+        members = [compiled[index] for index in group.members]
+        while running := [member for member in members if not member.is_finished]:
+            # Runs of a group have the same duration, and are at the same time.
+            group.advance_to(running[0].find_next_end())
+            for member in running:
+                member.pass_records()
+        for index, member in zip(group.members, members, strict=True):
+            yield index, _join_run(scenarios[index], member.run, batches[index]), group.obstacle
+            batches[index].clear()
+
+
+def _join_run(
+    scenario: Scenario, run: FusedRun, batches: Mapping[str, Sequence[RecordBatch]]
+) -> WholeRun:
+    """Returns a finished run with all of its records.
+
+    Args:
+        scenario: Its scenario.
+        run: The run.
+        batches: Batches of the records of each site.
+    """
     records = {}
     buckets = []
     last_tau_x = []
@@ -332,7 +412,7 @@ def run_whole(scenario: Scenario) -> _WholeRun:
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
     trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return _WholeRun(records, trace.classify_end(scenario), run)
+    return WholeRun(records, trace.classify_end(scenario), run)
 
 
 class Range(NamedTuple):

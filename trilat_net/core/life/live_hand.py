@@ -359,8 +359,23 @@ def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> flo
     return speed_step * (D / (n + 1.0) + 0.5 * n)
 
 
+@leaf
+def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
+    """Returns the time in which a target glides to the goal of a new message, ns.
+
+    Args:
+        between_messages_ns: Time from the previous message to the new one, ns.
+        rate_hz: Rate of the control loop, Hz.
+    """
+    period_ns = 1_000_000_000 // rate_hz
+    # A quarter more, so that the target does not stop when the next message is a little late.
+    glide_ns = between_messages_ns * 5 // 4
+    return min(max(glide_ns, period_ns), GLIDE_NS)
+
+
+_plain_glide_ns = getattr(find_glide_ns, "py_func", find_glide_ns)
 _plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
-"""The same function, uncompiled: a call from Python into compiled code takes longer than these
+"""The same functions, uncompiled: a call from Python into compiled code takes longer than these
 few operations.
 """
 
@@ -518,11 +533,8 @@ def _accept_command(
     if command.number == memory.number:
         return memory, ""
 
-    period_ns = 1_000_000_000 // rules.rate_hz
     between_messages_ns = command.sent_ns - memory.sent_ns
-    # A quarter more, so that the target does not stop when the next message is a little late.
-    glide_ns = between_messages_ns * 5 // 4
-    glide_ns = min(max(glide_ns, period_ns), GLIDE_NS)
+    glide_ns = _plain_glide_ns(between_messages_ns, rules.rate_hz)
     return _aim(rules, memory, command, t_ns + glide_ns), ""
 
 

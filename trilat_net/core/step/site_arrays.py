@@ -639,14 +639,14 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
     Example: arrays of the shapes (3,) and (5,) become one array of shape (2, 5).
     """
-    shapes = [array.shape for array in arrays]
-    shape = np.max(shapes, axis=0)
-    padded = []
-    for array in arrays:
-        missing = shape - array.shape
-        widths = [(0, count) for count in missing]
-        padded.append(np.pad(array, widths))
-    return np.stack(padded)
+    lengths = zip(*(array.shape for array in arrays), strict=True)
+    dtype = arrays[0].dtype
+    if any(array.dtype is not dtype for array in arrays):
+        dtype = np.result_type(*arrays)  # slow for rows
+    stacked = np.zeros((len(arrays), *map(max, lengths)), dtype)
+    for padded, array in zip(stacked, arrays, strict=True):
+        padded[tuple(map(slice, array.shape))] = array
+    return stacked
 
 
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:

@@ -2,7 +2,7 @@
 
 from .lane_rows import LANES
 from .lane_structure import describe_structure, find_obstacle
-from .run_groups import LEAST_RUNS, RunGroup, group_runs
+from .run_groups import LEAST_RUNS, RunGroup, group_runs, prepare_lanes
 
 __all__ = [
     "LANES",
@@ -11,4 +11,5 @@ __all__ = [
     "describe_structure",
     "find_obstacle",
     "group_runs",
+    "prepare_lanes",
 ]

@@ -126,6 +126,21 @@ class LaneRow(_PartOfTable):
         return dict(self.constants[0]).get(name)
 
 
+class LaneNumbers(types.Type):
+    """Numba's type of one integer per lane, a pointer to the first one."""
+
+    in_lanes = True
+
+    def __init__(self) -> None:
+        super().__init__(f"LaneNumbers({LANES})")
+
+    @property
+    def mangling_args(self) -> tuple[str, tuple[str]]:
+        """Name of the type in symbols of machine code."""
+        return "LaneNumbers", (f"n{LANES}",)
+
+
+@register_model(LaneNumbers)
 @register_model(LaneTable)
 class _TableModel(models.PrimitiveModel):
     """A table is represented by a pointer."""
@@ -334,6 +349,24 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
 
 
 @intrinsic
+def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
+    """Generates the integer of a lane, or the integer that all lanes share."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        numbers_type = sig.args[0]
+        data, lane = args
+        if isinstance(numbers_type, types.Integer):
+            return data
+        if isinstance(numbers_type, types.Array):
+            data = context.make_array(numbers_type)(context, builder, data).data
+        word = ir.IntType(64)
+        first = builder.bitcast(data, word.as_pointer())
+        return builder.load(builder.gep(first, [lane], source_etype=word))
+
+    return types.int64(numbers, types.intp), generate
+
+
+@intrinsic
 def _pointer_to(_context: Any, address: Any) -> Any:
     """Generates the conversion of an address to a pointer."""
 
@@ -348,6 +381,10 @@ in_lane: Any = _in_lane
 """Returns the rows of a table in one lane: `in_lane(table, lane)`."""
 select_row: Any = _select_row
 """Returns a row with its own constants: `select_row(rows, index)`. The index is a constant."""
+number_of: Any = _number_of
+"""Returns the integer of a lane: `number_of(numbers, lane)`. The numbers are `LaneNumbers`, an
+array with one entry per lane, or one integer that all lanes share.
+"""
 pointer_to: Any = _pointer_to
 """Converts the address of a table to a pointer, which stands for the table in calls."""
 

@@ -22,11 +22,14 @@ from ...core import (
     NEVER_NS,
     Array,
     IntArray,
+    SiteArrays,
     find_lane_address,
+    is_lane_code_stored,
+    leaf,
     read_lane_assembly,
     tick_ns,
 )
-from ...records import Mode
+from ...records import NS_PER_S, Mode
 from ..fused import FusedRun, RunMemory
 from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (
@@ -144,7 +147,10 @@ def find_layout(run: FusedRun) -> LaneLayout:
 
 
 def list_argument_types(
-    layout: LaneLayout, structure: RunStructure, site: SiteStructure
+    layout: LaneLayout,
+    structure: RunStructure,
+    site: SiteStructure,
+    clock: types.Type = types.int64,
 ) -> tuple[Any, ...]:
     """Returns Numba's types of the arguments of `advance_site` for a site.
 
@@ -152,6 +158,8 @@ def list_argument_types(
         layout: Layouts of the tables.
         structure: Structure of the run.
         site: Structure of the site.
+        clock: Type of the tick and of its nominal time: an integer if they are equal in all
+            lanes, else `LaneNumbers`.
     """
     first = site.first_environment
     actors = site.actors
@@ -179,7 +187,7 @@ def list_argument_types(
         chain=chain,
     )
     integer = types.int64
-    numbers = (*(integer,) * 3, types.float64, *(integer,) * 5)
+    numbers = (clock, clock, integer, types.float64, *(integer,) * 5)
     states = types.Array(types.float64, 4, "C")
     used = types.Array(types.int64, 3, "C")
     columns = types.Array(types.int64, 2, "C")
@@ -202,8 +210,13 @@ def choose_code(layout: LaneLayout) -> Callable[..., None]:
     return advance_site if layout.chain is None else advance_chain_site
 
 
-def _find_addresses(run: FusedRun, structure: RunStructure) -> IntArray:
+def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -> IntArray:
     """Compiles the code of each site of a run, or loads it, and returns its addresses.
+
+    Args:
+        run: The run.
+        structure: Its structure.
+        clock: Type of the ticks, see `list_argument_types`.
 
     Raises:
         NumbaError: A law of a user cannot be compiled in lanes.
@@ -211,24 +224,25 @@ def _find_addresses(run: FusedRun, structure: RunStructure) -> IntArray:
     layout = find_layout(run)
     addresses = []
     for site in structure.sites:
-        arguments = list_argument_types(layout, structure, site)
+        arguments = list_argument_types(layout, structure, site, clock)
         addresses.append(find_lane_address(choose_code(layout), arguments))
     return np.array(addresses)
 
 
-def explain_uncompilable(run: FusedRun) -> str:
+def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
     """Explains why the laws of a run cannot be compiled in lanes, although they can be alone.
 
     The code is compiled for this answer.
 
     Args:
         run: The run before its first tick. There must be no obstacle, see `find_obstacle`.
+        clock: Type of the ticks, see `list_argument_types`.
 
     Returns:
         The reason. Empty if there is none.
     """
     try:
-        _find_addresses(run, find_structure(run))
+        _find_addresses(run, find_structure(run), clock)
     except NumbaError:
         return "control laws that cannot be compiled side by side"
     return ""
@@ -245,6 +259,39 @@ def read_assembly(run: FusedRun, i: int) -> str:
     layout = find_layout(run)
     arguments = list_argument_types(layout, structure, structure.sites[i])
     return read_lane_assembly(choose_code(layout), arguments)
+
+
+@leaf
+def _copy_records(first: int, kept: Array, records: Array) -> None:
+    """Copies records from the lanes to arrays of each run.
+
+    Args:
+        first: First tick.
+        kept: Latest records of all sites, shape (N, rows, floats, LANES). The record of tick k
+            is in row k modulo the number of rows.
+        records: Written, shape (runs, N, ticks, floats).
+    """
+    # The numbers of all lanes in a record lie in few cache lines.
+    for i in range(records.shape[1]):
+        for tick in range(records.shape[2]):
+            row = (first + tick) & (kept.shape[1] - 1)
+            for lane in range(records.shape[0]):
+                for column in range(records.shape[3]):
+                    records[lane, i, tick, column] = kept[i, row, column, lane]
+
+
+def has_lane_code(run: FusedRun) -> bool:
+    """Returns True if the code for a run in lanes exists already.
+
+    Args:
+        run: The run. There must be no obstacle, see `find_obstacle`.
+    """
+    structure = find_structure(run)
+    layout = find_layout(run)
+    return all(
+        is_lane_code_stored(choose_code(layout), list_argument_types(layout, structure, site))
+        for site in structure.sites
+    )
 
 
 class _LinksOfRun:
@@ -307,7 +354,10 @@ class LaneRun:
 
     Attributes:
         runs: The runs that are in the lanes. `advance_to` writes the results into them.
+        clock: Type of the ticks, see `list_argument_types`.
     """
+
+    clock: types.Type = types.int64
 
     def __init__(self, runs: Sequence[FusedRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
@@ -354,7 +404,7 @@ class LaneRun:
         self._environments = self._actors.copy()
         self._sums = pack([memory.sums for memory in memories])
         self._progress = pack([memory.progress for memory in memories])
-        self._ramps = pack([_view_rows(arrays.ramps) for arrays in tables])
+        self._ramps = pack([view_rows(arrays.ramps) for arrays in tables])
         records = allocate_words(self._sites * record_rows, layout.floats)
         self._records = records.reshape(self._sites, record_rows, layout.floats, LANES)
         self._laws = allocate_words(self._sites, layout.law)
@@ -369,6 +419,7 @@ class LaneRun:
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
             site_rows=np.zeros_like(self._site),
+            links=np.zeros_like(self._links),
             records=np.zeros_like(self._records[:, 0]),
             sums=np.zeros_like(self._sums),
             progress=np.zeros_like(self._progress),
@@ -376,24 +427,25 @@ class LaneRun:
             sent=np.zeros_like(self._sent),
             peaks=np.zeros((self._sites, layout.columns, LANES), np.int64),
         )
-        self._put_first_states(tables)
-        self._addresses = _find_addresses(runs[0], structure)
+        for lane, arrays in enumerate(tables):
+            self._put_first_states(lane, arrays)
+        self._addresses = _find_addresses(runs[0], structure, self.clock)
 
-    def _put_first_states(self, tables: Sequence[Any]) -> None:
+    def _put_first_states(self, lane: int, arrays: SiteArrays) -> None:
         """Writes the states of all sites before the first tick, which their peers start with.
 
         Args:
-            tables: Arrays of the sites of each run.
+            lane: The lane.
+            arrays: Arrays of the sites of its run.
         """
-        for lane, arrays in enumerate(tables):
-            for j in range(self._sites):
-                # The peers of a site are all other sites: site 0 is a peer of site 1.
-                receiver = 1 if j == 0 else 0
-                link = arrays.links[receiver, j if j < receiver else j - 1]
-                for n, name in enumerate(_STATE_FIELDS):
-                    joints = self._layout.joints
-                    columns = slice(n * joints, (n + 1) * joints)
-                    self._states[j, self._pages, lane, columns] = link[name]
+        for j in range(self._sites):
+            # The peers of a site are all other sites: site 0 is a peer of site 1.
+            receiver = 1 if j == 0 else 0
+            link = arrays.links[receiver, j if j < receiver else j - 1]
+            for n, name in enumerate(_STATE_FIELDS):
+                joints = self._layout.joints
+                columns = slice(n * joints, (n + 1) * joints)
+                self._states[j, self._pages, lane, columns] = link[name]
 
     def _put_laws(self, memories: Sequence[RunMemory]) -> None:
         """Copies the numbers of compiled laws into the lanes.
@@ -454,8 +506,17 @@ class LaneRun:
         for lane in lanes:
             self.runs[lane].plan([ticks] * self._sites)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
+        first = self._ticks
         self._step_to(ticks)
+        records = None
+        if self._records.shape[1] > 1:
+            count = min(self._ticks - first, self._records.shape[1])
+            shape = (len(self.runs), self._sites, count, self._layout.floats)
+            records = np.empty(shape)
+            _copy_records(self._ticks - count, self._records.view(np.float64), records)
         for lane in lanes:
+            if records is not None:
+                self._write_records(lane, self.runs[lane], records[lane])
             self._write_back(lane, self.runs[lane], until_s)
 
     def _use_samples(self, first: int, count: int) -> int:
@@ -484,16 +545,7 @@ class LaneRun:
         Args:
             ticks: Number of ticks since the start of the runs.
         """
-        present = EndedRuns(
-            ticks=self._ended.ticks,
-            site_rows=self._site,
-            records=self._records,
-            sums=self._sums,
-            progress=self._progress,
-            laws=self._laws,
-            sent=self._sent,
-            peaks=self._ended.peaks,
-        )
+        present = self._list_present()
         site_fields: Any = self._layout.site.fields
         _, mode_offset = site_fields["mode"]
         tables = self._find_tables()
@@ -521,6 +573,20 @@ class LaneRun:
                 ended=self._ended,
             )
             self._ticks += count
+
+    def _list_present(self) -> EndedRuns:
+        """Returns the tables of all runs now, see `keep_ended_runs`."""
+        return EndedRuns(
+            ticks=self._ended.ticks,
+            site_rows=self._site,
+            links=self._links,
+            records=self._records,
+            sums=self._sums,
+            progress=self._progress,
+            laws=self._laws,
+            sent=self._sent,
+            peaks=self._ended.peaks,
+        )
 
     def _keep_states(self, ticks: int) -> None:
         """Makes room for the states of more ticks, if necessary.
@@ -569,6 +635,25 @@ class LaneRun:
         peaks[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = peaks
 
+    def _write_records(self, lane: int, run: FusedRun, records: Array) -> None:
+        """Writes the latest records of a lane into its run.
+
+        Args:
+            lane: The lane.
+            run: The run.
+            records: Records of all sites in the latest ticks of the lanes, shape (N, ticks,
+                floats).
+        """
+        sent = run.memory.sent
+        ended_ticks = int(self._ended.ticks[lane])
+        end = self._ticks if ended_ticks < 0 else ended_ticks
+        first = self._ticks - records.shape[1]
+        ticks = np.arange(max(first, end - sent.t_ns.shape[1]), end)
+        pages = ticks % sent.t_ns.shape[1]
+        # The equation of `tick_ns`.
+        sent.t_ns[:, pages] = ticks * NS_PER_S // self._rate_hz
+        sent.rows[:, pages] = records[:, ticks - first]
+
     def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
         """Writes the numbers of a lane into its run.
 
@@ -595,8 +680,8 @@ class LaneRun:
         if has_ended:
             peaks[:, last_bucket] = self._ended.peaks[:, :, lane].view(np.float64)
 
-        _put_rows(tables.site, site_rows[:, :, lane])
-        _put_rows(memory.sums, sums[:, :, lane])
+        put_rows(tables.site, site_rows[:, :, lane])
+        put_rows(memory.sums, sums[:, :, lane])
         unsettled_ns = progress[:, :, lane].copy()
         rows = unsettled_ns.view(memory.progress.dtype).reshape(-1)
         memory.progress["unsettled_ns"] = rows["unsettled_ns"]
@@ -626,7 +711,7 @@ class LaneRun:
             )
 
 
-def _view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
+def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
     """Returns a table of shape (N, rows, columns) as N words rows."""
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
@@ -645,7 +730,7 @@ def _check_distinct(tables: SiteTables) -> None:
         assert end <= start
 
 
-def _put_rows(rows: NDArray[Any], numbers: Words) -> None:
+def put_rows(rows: NDArray[Any], numbers: Words) -> None:
     """Overwrites structured rows by their words, shape (rows, words of a row)."""
     new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
     rows[...] = new_rows.reshape(rows.shape)

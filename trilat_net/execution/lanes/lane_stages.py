@@ -20,7 +20,6 @@ from ...core import (
     Array,
     IntArray,
     Law,
-    Pair,
     SourceTorque,
     TorqueTable,
     Vector,
@@ -47,7 +46,7 @@ from ...core import (
 )
 from ...records import Mode
 from .lane_laws import compute_law
-from .lane_rows import Words, in_lane, pointer_to, select_row
+from .lane_rows import Words, in_lane, number_of, pointer_to, select_row
 
 _DIVERGED = int(Mode.DIVERGED)
 _USER = int(Law.USER)
@@ -118,11 +117,11 @@ def _advance_stage(
     t_s: float,
     ahead_s: float,
     s: Any,
-    qd_before: Pair,
-    qdd_before: Pair,
+    qd_before: Vector,
+    qdd_before: Vector,
     actors: Any,
     table: TorqueTable,
-) -> tuple[Pair, Pair]:
+) -> Any:
     """Evaluates a stage of the integrator, see `two_link_stages.advance_stage`.
 
     Args:
@@ -152,8 +151,8 @@ def _advance_stage(
 
 @lane_leaf
 def advance_site(
-    k: int,
-    t_ns: int,
+    k: Any,
+    t_ns: Any,
     lanes: int,
     settled_rad: float,
     i: int,
@@ -186,8 +185,8 @@ def advance_site(
     All tables have a lane for each run. No two of them overlap in memory.
 
     Args:
-        k: The tick.
-        t_ns: Its nominal time, ns since the epoch.
+        k: The tick, of all lanes or of each lane, see `number_of`.
+        t_ns: Its nominal time, ns since the epoch, of all lanes or of each lane.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
@@ -221,13 +220,14 @@ def advance_site(
         rows = in_lane(links, lane)
         for p in range(rows.shape[0]):
             link = rows[p]
+            lane_ns = number_of(t_ns, lane)
             sample = used[p, lane, block_row]
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
             if in_lane(site, lane)[0].law == _USER:
                 link.new = sample > link.used
-                link.used_ns = t_ns if sample > link.used else link.used_ns
+                link.used_ns = lane_ns if sample > link.used else link.used_ns
             link.used = sample
             for c in range(JOINTS):
                 link.q[c] = states[peer, page, lane, c]
@@ -248,8 +248,8 @@ def advance_site(
     # 3 reference, 4 errors, 5 estimate
     for lane in range(lanes):
         reference_stages(
-            k=k,
-            t_ns=t_ns,
+            k=number_of(k, lane),
+            t_ns=number_of(t_ns, lane),
             site=in_lane(site, lane),
             links=in_lane(links, lane),
             ramps=in_lane(ramps, lane)[0].rows,
@@ -264,8 +264,8 @@ def advance_site(
     for lane in range(lanes):
         compute_law(
             code,
-            k,
-            t_ns,
+            number_of(k, lane),
+            number_of(t_ns, lane),
             in_lane(site, lane),
             in_lane(links, lane),
             in_lane(law, lane),
@@ -276,8 +276,14 @@ def advance_site(
     # 6 limits of the torque, 7 emit
     for lane in range(lanes):
         floats = in_lane(record, lane)[record_row].floats
-        emit_stages(k=k, t_ns=t_ns, s=in_lane(site, lane)[0], chain=None, record=floats)
-        page = k & (pages - 1)
+        emit_stages(
+            k=number_of(k, lane),
+            t_ns=number_of(t_ns, lane),
+            s=in_lane(site, lane)[0],
+            chain=None,
+            record=floats,
+        )
+        page = number_of(k, lane) & (pages - 1)
         for c in range(JOINTS):
             states[i, page, lane, c] = floats[c]
             states[i, page, lane, JOINTS + c] = floats[JOINTS + c]
@@ -288,18 +294,17 @@ def advance_site(
             number = in_lane(sent, lane)[0].numbers[c]
             floats = in_lane(record, lane)[record_row].floats
             floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
-            states[i, k & (pages - 1), lane, 3 * JOINTS + c] = number
+            states[i, number_of(k, lane) & (pages - 1), lane, 3 * JOINTS + c] = number
 
     # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
     # processor begins with the next lanes while it waits for results of the previous ones.
-    t_s = t_ns * 1e-9
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         if s.mode != _DIVERGED:
-            hold_motor_torque(k, s)
+            hold_motor_torque(number_of(k, lane), s)
         stages = in_lane(scratch, lane)[0]
         qdd = two_link_stages.find_stage_acceleration(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             q=pair(s.q),
             qd=pair(s.qd),
             u=pair(s.u),
@@ -314,7 +319,7 @@ def advance_site(
         s = in_lane(site, lane)[0]
         stages = in_lane(scratch, lane)[0]
         qd, qdd = _advance_stage(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=0.5 * (1.0 / s.rate_hz),
             s=s,
             qd_before=pair(s.qd),
@@ -328,7 +333,7 @@ def advance_site(
         s = in_lane(site, lane)[0]
         stages = in_lane(scratch, lane)[0]
         qd, qdd = _advance_stage(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=0.5 * (1.0 / s.rate_hz),
             s=s,
             qd_before=pair(stages.qd_2),
@@ -343,7 +348,7 @@ def advance_site(
         stages = in_lane(scratch, lane)[0]
         h_s = 1.0 / s.rate_hz
         qd_4, qdd_4 = _advance_stage(
-            t_s=t_s,
+            t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=h_s,
             s=s,
             qd_before=pair(stages.qd_3),
@@ -376,7 +381,7 @@ def advance_site(
         site_sums = in_lane(sums, lane)[0]
         update_peaks(
             row=floats,
-            t_ns=t_ns,
+            t_ns=number_of(t_ns, lane),
             settled_rad=settled_rad,
             s=s,
             progress=in_lane(progress, lane)[0],
@@ -384,8 +389,8 @@ def advance_site(
             sums=site_sums,
         )
         update_sums(
-            k=k,
-            t_ns=t_ns,
+            k=number_of(k, lane),
+            t_ns=number_of(t_ns, lane),
             s=s,
             chain=None,
             environments=in_lane(environments, lane),
@@ -405,6 +410,8 @@ class EndedRuns(NamedTuple):
         ticks: Number of ticks that each run has made, shape (LANES,). -1: the run has not
             ended.
         site_rows: Rows of the sites, shape (N, words of a row, LANES).
+        links: Rows of the links, shape (N P, words of a row, LANES). Only `LaneEpisodes` keeps
+            them: in `keep_ended_runs` their copy makes all ticks slower by half.
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words of a row, LANES).
         progress: Rows of the progress, shape (N, words of a row, LANES).
@@ -415,6 +422,7 @@ class EndedRuns(NamedTuple):
 
     ticks: IntArray
     site_rows: Words
+    links: Words
     records: Words
     sums: Words
     progress: Words
@@ -424,7 +432,7 @@ class EndedRuns(NamedTuple):
 
 
 @leaf
-def _copy_lane(lane: int, source: Words, target: Words) -> None:
+def copy_lane(lane: int, source: Words, target: Words) -> None:
     """Copies the numbers of one lane.
 
     Args:
@@ -438,8 +446,8 @@ def _copy_lane(lane: int, source: Words, target: Words) -> None:
 
 
 @leaf
-def _keep_ended_runs(
-    ticks: int,
+def keep_ended_runs(
+    ticks: Any,
     runs: int,
     mode_word: int,
     bucket: int,
@@ -451,7 +459,7 @@ def _keep_ended_runs(
     """Keeps the numbers of runs of which an arm left its limits in the present tick.
 
     Args:
-        ticks: Number of ticks that the runs have made.
+        ticks: Number of ticks that the runs have made, of all runs or of each run.
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
         bucket: The present bucket.
@@ -474,14 +482,14 @@ def _keep_ended_runs(
         if not has_diverged:
             running += 1
             continue
-        ended.ticks[lane] = ticks
-        _copy_lane(lane, present.site_rows, ended.site_rows)
-        _copy_lane(lane, present.records[:, record_row], ended.records)
-        _copy_lane(lane, present.sums, ended.sums)
-        _copy_lane(lane, present.progress, ended.progress)
-        _copy_lane(lane, present.laws, ended.laws)
-        _copy_lane(lane, present.sent, ended.sent)
-        _copy_lane(lane, peaks[:, bucket], ended.peaks)
+        ended.ticks[lane] = number_of(ticks, lane)
+        copy_lane(lane, present.site_rows, ended.site_rows)
+        copy_lane(lane, present.records[:, record_row], ended.records)
+        copy_lane(lane, present.sums, ended.sums)
+        copy_lane(lane, present.progress, ended.progress)
+        copy_lane(lane, present.laws, ended.laws)
+        copy_lane(lane, present.sent, ended.sent)
+        copy_lane(lane, peaks[:, bucket], ended.peaks)
     return running
 
 
@@ -574,7 +582,7 @@ def run_block(
                     table,
                 ),
             )
-        running = _keep_ended_runs(
+        running = keep_ended_runs(
             ticks=k + 1,
             runs=runs,
             mode_word=mode_word,

@@ -74,11 +74,13 @@ def _list_actors(actors: Any) -> list[Any]:
     return [row for row in actors if row["sampled"] in (0, 1)]
 
 
-def find_obstacle(run: FusedRun) -> str:
+def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
     """Explains why a run cannot be computed together with other runs.
 
     Args:
         run: The run before its first tick.
+        hand_site: Index of a site whose live operator the caller replaces, because it knows the
+            actions of this operator. -1: there is none.
 
     Returns:
         The property of the run that lanes do not support. Empty if there is none.
@@ -93,10 +95,11 @@ def find_obstacle(run: FusedRun) -> str:
             return obstacle
     if run.memory.has_plain_law:
         return "control laws in plain Python"
-    if run.has_programs:
+    if run.programmed_sites - {hand_site}:
         return "programs that move an arm"
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
-    if kinds.intersection(LIVE_KINDS):
+    # Live operators whom no program replaces do nothing.
+    if hand_site < 0 and kinds.intersection(LIVE_KINDS):
         return "hands that move an arm live"
     if kinds.intersection(OWN_KINDS):
         return "operators or environments that users wrote"

@@ -6,13 +6,22 @@ Invariant:
 
 from collections.abc import Iterator, Sequence
 
+from ...scenario import Scenario
 from ..fused import FusedRun
 from .lane_rows import LANES
-from .lane_run import LaneRun, explain_uncompilable
+from .lane_run import LaneRun, explain_uncompilable, has_lane_code
 from .lane_structure import RunStructure, find_obstacle, find_structure
 
 LEAST_RUNS = 4
 """Number of runs from which lanes are faster than one run after the other."""
+
+
+LANE_SITE_TICKS = 100_000_000
+"""Number of site ticks from which a study compiles the code for several runs side by side.
+
+The compilation takes some ten seconds per kind of site. The code then saves about 0.4 us per
+site tick.
+"""
 
 
 class RunGroup:
@@ -23,6 +32,7 @@ class RunGroup:
         runs: The runs before their first tick.
         in_lanes: True to compute them in lanes. They must have the same structure.
         obstacle: Property because of which the runs cannot be computed in lanes, or empty.
+        record_rows: Number of latest records of each site that lanes keep, a power of two.
 
     Attributes:
         members: Indices of the runs that are left in the group.
@@ -36,11 +46,12 @@ class RunGroup:
         *,
         in_lanes: bool,
         obstacle: str = "",
+        record_rows: int = 1,
     ) -> None:
         self.members = list(members)
         self.obstacle = obstacle
         self._runs = list(runs)
-        self._lanes = LaneRun(runs) if in_lanes else None
+        self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
         """Continues the runs until they are as long as a run of `until_s` seconds.
@@ -73,11 +84,37 @@ class RunGroup:
         self._runs = [self._runs[position] for position in chosen]
 
 
-def group_runs(runs: Sequence[FusedRun]) -> Iterator[RunGroup]:
+def prepare_lanes(
+    scenario: Scenario, runs: int, least_site_ticks: int = LANE_SITE_TICKS
+) -> bool:
+    """Decides whether runs are computed in lanes, and compiles the code in this case.
+
+    Lanes are used if the runs are long enough for the compilation, or if the code exists.
+
+    Args:
+        scenario: Scenario of one of the runs.
+        runs: Number of runs with this structure.
+        least_site_ticks: Number of site ticks from which the code is worth its compilation.
+    """
+    rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
+    site_ticks = runs * scenario.duration_s * sum(rates_hz)
+    probes = [FusedRun(scenario) for _ in range(LEAST_RUNS)]
+    if runs < LEAST_RUNS or find_obstacle(probes[0]):
+        return False
+    if site_ticks < least_site_ticks and not has_lane_code(probes[0]):
+        return False
+    for group in group_runs(probes):
+        group.advance_to(1.0 / max(rates_hz))
+    return True
+
+
+def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGroup]:
     """Divides runs into groups that can be advanced together.
 
     Args:
         runs: The runs before their first tick.
+        record_rows: Number of ticks, a power of two, of which `FusedRun.pop_records` must find
+            the records after each call of `RunGroup.advance_to`.
 
     Yields:
         The groups, each when the work on the previous one has ended.
@@ -97,7 +134,7 @@ def group_runs(runs: Sequence[FusedRun]) -> Iterator[RunGroup]:
             if len(members) >= LEAST_RUNS:
                 obstacle = explain_uncompilable(chosen[0])
                 if not obstacle:
-                    yield RunGroup(members, chosen, in_lanes=True)
+                    yield RunGroup(members, chosen, in_lanes=True, record_rows=record_rows)
                     continue
             for index, run in zip(members, chosen, strict=True):
                 yield RunGroup([index], [run], in_lanes=False, obstacle=obstacle)

@@ -13,32 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import Array, IntArray, ReplayedInputs, first_tick_at, is_lane_code_stored
+from ...core import Array, IntArray, ReplayedInputs, first_tick_at
 from ...records import NS_PER_S
 from ..fused import FusedRun, mark_floats, scale_differences
 from .lane_deliveries import use_recorded_samples
 from .lane_rows import LANES, Words
-from .lane_run import LaneRun, choose_code, find_layout, list_argument_types
-from .lane_structure import find_obstacle, find_structure
+from .lane_run import LaneRun, has_lane_code
+from .lane_structure import find_obstacle
 from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
     """A run in lanes cannot continue, because an arm left its limits or a law failed."""
-
-
-def has_lane_code(run: FusedRun) -> bool:
-    """Returns True if the code for a run in lanes exists already.
-
-    Args:
-        run: The run. There must be no obstacle, see `find_obstacle`.
-    """
-    structure = find_structure(run)
-    layout = find_layout(run)
-    return all(
-        is_lane_code_stored(choose_code(layout), list_argument_types(layout, structure, site))
-        for site in structure.sites
-    )
 
 
 def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> bool:

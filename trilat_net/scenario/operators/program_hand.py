@@ -23,6 +23,7 @@ from ...core import (
     Array,
     HandContext,
     HandProgram,
+    HandRules,
     HandView,
     OwnHand,
     Site,
@@ -182,9 +183,7 @@ class HandSite(NamedTuple):
         arm.
         """
         spec = self.spec
-        rules = spec.make_rules(
-            self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
-        )
+        rules = self.make_rules()
         return HandContext(
             site=self.name,
             peers=self.scenario.peers(self.name),
@@ -197,6 +196,11 @@ class HandSite(NamedTuple):
             seed=self.scenario.draw_seed(self.name),
         )
 
+    def make_rules(self) -> HandRules:
+        """Returns the limits of the actions of the program."""
+        tick_rate_hz = self.scenario.sites[self.name].rate_hz
+        return self.spec.make_rules(tick_rate_hz, self.scenario.arms[self.name])
+
     def make_hand(self) -> OwnHand:
         """Creates the object that calls the program and applies its actions at the right ticks.
 
@@ -208,8 +212,7 @@ class HandSite(NamedTuple):
         locate: Any = list if self.spec.mode == "joint" else arm.end_effector
         # Rounded first: in floating point 9 ms at 1000 Hz are a little more than 9 ticks.
         delay_ticks = math.ceil(round(self.delay_s * tick_rate_hz, 6))
-        rules = self.spec.make_rules(tick_rate_hz, arm)
-        return OwnHand(rules, tick_rate_hz // self.rate_hz, delay_ticks, locate)
+        return OwnHand(self.make_rules(), tick_rate_hz // self.rate_hz, delay_ticks, locate)
 
     @classmethod
     def find(cls, scenario: "Scenario", site: str) -> "HandSite | None":

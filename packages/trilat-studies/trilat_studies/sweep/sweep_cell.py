@@ -14,10 +14,10 @@ Invariant:
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -31,7 +31,7 @@ from trilat_net.analysis import (
     find_run_roots,
     judge_virtual_run,
 )
-from trilat_net.execution import FusedRun, RunTotals, check_fusable
+from trilat_net.execution import FusedRun, check_fusable
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -67,6 +67,8 @@ class CellClass(StrEnum):
 
 RUN_CLASSES = tuple(verdict for verdict in CellClass if verdict is not CellClass.REFUSED)
 """Classes of a cell that ran. A refused cell is not a valid scenario."""
+TOTAL_KEYS = ("rms_error_rad", "effort_nm", "force_peak_n", "walls_j")
+"""Fields of a result that summarise the whole run, see `RunTotals`."""
 
 
 def classify_decision(stability: Stability, behaviour: EndBehaviour) -> CellClass:
@@ -222,7 +224,7 @@ class _CellInProgress:
         Totals, such as the RMS error, are taken here, before any extension. A run that chatters
         at a wall is not extended, see `classify_cell`.
         """
-        self._totals = self.run.totals
+        self._totals = self.run.totals._asdict()
         self._outcome = self._build_result()
         if self._end_s < self._longest_s and _chatters(self._scenario, self.run):
             self._longest_s = self._end_s
@@ -482,14 +484,14 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 
 
 def _build_result(
-    run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int
+    run: FusedRun, scenario: Scenario, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
     """Returns the result of a run up to the time that the run has reached.
 
     Args:
         run: The run.
         scenario: Scenario of the run.
-        totals: Totals over the scenario's duration, without extensions.
+        totals: Totals over the scenario's duration, without extensions, see `RunTotals`.
         extended: Number of times that the duration was doubled.
     """
     end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
@@ -505,7 +507,7 @@ def _build_result(
         peak_error_rad=max(float(values[:, 0].max()) for values in run.maxima),
         settled_s=run.settled_s,
         diverged_s=end.diverged_at_s,
-        **totals._asdict(),
+        **totals,
         reasons="; ".join(end.reasons),
     )
 

@@ -31,7 +31,6 @@ import msgspec
 
 from trilat_net.analysis import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
-from trilat_net.execution import RunTotals
 from trilat_net.files import write_whole
 from trilat_net.results import Result
 from trilat_net.scenario import read_source
@@ -47,7 +46,14 @@ from .result_table import (
     list_axis_columns,
     read_rows,
 )
-from .sweep_cell import RUN_CLASSES, CellClass, CellResult, CellRun, apply_diff
+from .sweep_cell import (
+    RUN_CLASSES,
+    TOTAL_KEYS,
+    CellClass,
+    CellResult,
+    CellRun,
+    apply_diff,
+)
 from .sweep_plan import SweepPlan, plan_from_json
 
 RESULTS_FILE = "results.csv"
@@ -341,7 +347,7 @@ def list_totals(plan: SweepPlan) -> list[str]:
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
     """
-    keys = (*RunTotals._fields, *plan.metrics)
+    keys = (*TOTAL_KEYS, *plan.metrics)
     return list(dict.fromkeys(keys))
 
 

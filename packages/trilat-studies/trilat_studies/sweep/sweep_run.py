@@ -34,7 +34,7 @@ from trilat_net.errors import (
     count_nouns,
     format_wall_time,
 )
-from trilat_net.execution import FusedRun, simulate_scenario
+from trilat_net.execution import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
@@ -457,15 +457,13 @@ def _compile_lanes(plan: SweepPlan) -> None:
     Args:
         plan: The sweep. The code is that of its first cell.
     """
-    from trilat_net.execution import group_runs
+    from trilat_net.execution import prepare_lanes
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
     except ScenarioError:
-        return  # the workers compile it
-    runs = [FusedRun(scenario) for _ in range(LANE_RUNS)]
-    for group in group_runs(runs):
-        group.advance_to(1.0 / max(spec.rate_hz for spec in plan.base.sites.values()))
+        return  # the workers compile the code
+    prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
 
 
 def describe_runs_alone(finished: FinishedSweep) -> str:

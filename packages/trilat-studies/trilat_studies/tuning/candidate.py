@@ -57,7 +57,7 @@ from trilat_net.analysis import (
     plan_dominance,
 )
 from trilat_net.core import Array
-from trilat_net.errors import ScenarioError
+from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
 from trilat_net.records import NS_PER_S
@@ -71,7 +71,7 @@ from trilat_net.scenario import (
 )
 from trilat_net.work import MeanInterval
 
-from ..measure_run import RecordBatch, refuse_live_only, run_whole
+from ..measure_run import RecordBatch, WholeRun, refuse_live_only, run_whole, run_whole_together
 from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
@@ -500,6 +500,16 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
     """
     run = _measure_run(parse_scenario(text))
     twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
+    return _score_candidate(run, twin)
+
+
+def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScore:
+    """Returns the score of a candidate.
+
+    Args:
+        run: What was measured in its run.
+        twin: What was measured in the twin, or in the run itself if there is no twin.
+    """
     ends = (run.end, twin.end)
     outcome = classify_candidate(ends, twin.fall_rad, twin.apart_rad)
 
@@ -565,7 +575,17 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
     Args:
         scenario: Scenario of the candidate, with its gains.
     """
-    records_by_site, end, _ = run_whole(scenario)
+    return _measure_records(scenario, run_whole(scenario))
+
+
+def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
+    """Measures the records of a run, see `_measure_run`.
+
+    Args:
+        scenario: Scenario of the candidate, with its gains.
+        whole_run: Its run.
+    """
+    records_by_site, end, _ = whole_run
     records = list(records_by_site.values())
     t_s, q, e, tau_x = _sample_at_common_times(records)
     mean_rad = q.mean(axis=0)
@@ -847,6 +867,43 @@ def measure_candidate_task(task: CandidateItem) -> CandidateScore:
     """
     scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
     return average_scores(scores)
+
+
+LANE_RUNS = 16
+"""Number of runs that a worker computes side by side. All their records are in memory."""
+
+
+def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[CandidateScore]:
+    """Runs several candidates with all of their seeds, side by side where that is possible.
+
+    Args:
+        tasks: The runs of each candidate.
+
+    Yields:
+        The average scores in the order of the candidates, equal to `measure_candidate_task`.
+    """
+    texts = [text for task in tasks for texts in task.runs for text in texts if text]
+    scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
+    measured = {}
+    chosen = list(scenarios)
+    try:
+        for first in range(0, len(chosen), LANE_RUNS):
+            part = chosen[first : first + LANE_RUNS]
+            for index, run, _ in run_whole_together([scenarios[text] for text in part]):
+                text = part[index]
+                measured[text] = _measure_records(scenarios[text], run)
+    except CodeFailed:
+        # One by one, the candidates before the one whose code fails are kept.
+        for task in tasks:
+            yield measure_candidate_task(task)
+        return
+    for task in tasks:
+        yield average_scores(
+            [
+                _score_candidate(measured[text], measured[twin_text or text])
+                for text, twin_text in task.runs
+            ]
+        )
 
 
 def load_tuning_scenario(

@@ -36,12 +36,13 @@ from trilat_net.execution import FusedRun
 from trilat_net.net import SystemClock
 from trilat_net.own_code import name_law_classes
 from trilat_net.results import Result
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 from trilat_net.workers import count_cores
 
 from .candidate import (
     CLASS_MEANINGS,
+    LANE_RUNS,
     CandidateClass,
     CandidateItem,
     CandidateScore,
@@ -52,6 +53,7 @@ from .candidate import (
     load_tuning_scenario,
     measure_candidate,
     measure_candidate_task,
+    measure_candidate_tasks,
 )
 from .search_space import (
     PAPER_GAINS,
@@ -507,13 +509,25 @@ class TuningPlan(NamedTuple):
             for round_number in range(len(searches[0].rounds)):
                 proposals = [search.propose_candidates(round_number) for search in searches]
                 items: list[CandidateItem] = []
+                firsts = []
                 for search, candidates in zip(searches, proposals, strict=True):
-                    items += self._build_items(bases, search.space, candidates)
+                    items_of_law = self._build_items(bases, search.space, candidates)
+                    firsts += items_of_law[:1]
+                    items += items_of_law
                 if round_number == 0:
                     items += paper_items
+                    in_lanes = self._uses_lanes(firsts)
                 # The scores come in the order of the items: those of each law, and in the first
                 # round those of the printed gains, which remain in the end.
-                scores = iter(pool.map(measure_candidate_task, items, report_progress))
+                scores = iter(
+                    pool.map(
+                        measure_candidate_task,
+                        items,
+                        report_progress,
+                        together=measure_candidate_tasks if in_lanes else None,
+                        together_count=LANE_RUNS if in_lanes else 1,
+                    )
+                )
                 finished += len(items)
                 for search, candidates in zip(searches, proposals, strict=True):
                     search.record_scores(candidates, [next(scores) for _ in candidates])
@@ -522,6 +536,20 @@ class TuningPlan(NamedTuple):
         for name, score in zip(paper_names, paper_scores, strict=True):
             printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
         return TuningResult(self, searches, printed)
+
+    def _uses_lanes(self, firsts: Sequence[CandidateItem]) -> bool:
+        """Returns True if the runs of all laws are to be computed side by side.
+
+        Args:
+            firsts: One candidate of each law.
+        """
+        # imported here, because the code of lanes takes long to load
+        from trilat_net.execution import prepare_lanes
+
+        return all(
+            prepare_lanes(parse_scenario(first.runs[0][0]), self.budget * len(first.runs))
+            for first in firsts
+        )
 
     def _build_items(
         self,

@@ -1,0 +1,539 @@
+"""Advances runs of one structure side by side that begin at different times.
+
+A run in a lane is replaced by another one when it has ended. Therefore each lane has a clock of
+its own. In each run a program may move the arm of one site; its actions come from outside.
+
+Invariant:
+    - After each call of `advance`, a run has the state that `FusedRun.step_to` gives it with
+      the same actions, bit for bit.
+    - A lane does not depend on the other lanes.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import (
+    LINK_MODEL_DTYPE,
+    Array,
+    HandRules,
+    IntArray,
+    SeveralHands,
+    call_address,
+    leaf,
+    tick_ns,
+)
+from ..fused import FusedRun
+from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
+from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
+from .lane_run import LaneRun, explain_uncompilable, put_rows, view_rows
+from .lane_stages import EndedRuns, copy_lane, keep_ended_runs
+from .lane_structure import RunStructure, find_obstacle, find_structure
+from .run_groups import LEAST_RUNS
+
+_CLOCK = LaneNumbers()
+
+
+@leaf
+def _use_samples_of_lanes(
+    runs: int,
+    first: IntArray,
+    count: int,
+    rate_hz: int,
+    skipped: IntArray,
+    states: LinkStates,
+    draws: DrawAddresses,
+    used: IntArray,
+) -> int:
+    """Finds the samples that are used in a span of ticks, which differs from lane to lane.
+
+    Args:
+        runs: Number of runs.
+        first: First tick of each lane, shape (LANES,).
+        count: Number of ticks.
+        rate_hz: Tick rate of all sites, Hz.
+        skipped: -1 for lanes that are advanced, shape (LANES,).
+        states: State of the links of the runs; changed.
+        draws: Functions that draw random numbers.
+        used: Written, see `use_samples`.
+
+    Returns:
+        The largest age of a sample in use, ticks.
+    """
+    largest_age = 0
+    for lane in range(runs):
+        own = slice(lane, lane + 1)
+        of_lane = LinkStates(
+            states.links[own],
+            states.models[own],
+            states.points[own],
+            states.releases[own],
+            states.newest[own],
+            states.uniforms,
+            states.delays_us,
+            states.stamps_ns,
+        )
+        age = use_samples(
+            first=first[lane],
+            count=count,
+            rate_hz=rate_hz,
+            ended=skipped[own],
+            states=of_lane,
+            draws=draws,
+            used=used[:, :, own],
+        )
+        largest_age = max(largest_age, age)
+    return largest_age
+
+
+@leaf
+def _put_actions(
+    actions: Array, hand_row: int, columns: IntArray, actors: Array, runs: int
+) -> None:
+    """Writes the actions of all programs in a tick into the rows of their operators.
+
+    Args:
+        actions: The actions, shape (5, LANES).
+        hand_row: Row of the operator.
+        columns: Word of each number of an action in this row, shape (5,).
+        actors: Rows of operators and environments, seen as floats, shape (rows, words, LANES).
+        runs: Number of runs.
+    """
+    for n in range(columns.shape[0]):
+        for lane in range(runs):
+            actors[hand_row, columns[n], lane] = actions[n, lane]
+
+
+@leaf
+def _run_span(
+    first: IntArray,
+    count: int,
+    rate_hz: int,
+    runs: int,
+    settled_rad: float,
+    pages: int,
+    mode_word: int,
+    addresses: IntArray,
+    tables: IntArray,
+    clock: Words,
+    clock_addresses: IntArray,
+    actions: Array,
+    hand_row: int,
+    columns: IntArray,
+    actors: Array,
+    states: Array,
+    used: IntArray,
+    received_columns: IntArray,
+    table: Array,
+    peaks: Words,
+    present: EndedRuns,
+    ended: EndedRuns,
+) -> int:
+    """Steps all sites of several runs through a span of ticks, as `run_block` does.
+
+    Args:
+        first: First tick of each run, shape (LANES,).
+        count: Number of ticks.
+        rate_hz: Tick rate of all sites, Hz.
+        runs: Number of runs.
+        settled_rad: Position error below which an arm counts as settled, rad.
+        pages: Number of latest states of each site, a power of two.
+        mode_word: Index of the mode among the words of a site's row.
+        addresses: Addresses of the code, see `run_block`.
+        tables: Addresses of the tables, see `run_block`.
+        clock: Room for the tick of each lane and its nominal time, shape (2, 1, LANES).
+        clock_addresses: Addresses of both rows of `clock`.
+        actions: Actions of the programs, shape (ticks, 5, LANES).
+        hand_row: Row of the operator whose place the programs take.
+        columns: Words of an action in this row.
+        actors: Rows of operators and environments; changed.
+        states: The latest states of all sites, see `advance_site`.
+        used: Samples in use, see `use_samples`.
+        received_columns: Indices of the numbers that laws receive, shape (N, P, C).
+        table: Tables of the operators and environments.
+        peaks: Room for the peaks of all sites in one bucket, which are not used.
+        present: The numbers of all runs.
+        ended: Numbers of the runs of which an arm left its limits; changed.
+
+    Returns:
+        The number of runs that have not ended in this way.
+    """
+    running = runs
+    lanes = (runs + 7) // 8 * 8
+    for block_row in range(count):
+        for lane in range(LANES):
+            k = first[lane] + block_row
+            clock[0, 0, lane] = k
+            clock[1, 0, lane] = tick_ns(k, rate_hz)
+        _put_actions(actions[block_row], hand_row, columns, actors, runs)
+        for i in range(addresses.shape[0]):
+            call_address(
+                addresses[i],
+                (
+                    pointer_to(clock_addresses[0]),
+                    pointer_to(clock_addresses[1]),
+                    lanes,
+                    settled_rad,
+                    i,
+                    block_row,
+                    pages,
+                    0,
+                    0,
+                    pointer_to(tables[i, 0]),
+                    pointer_to(tables[i, 1]),
+                    pointer_to(tables[i, 2]),
+                    pointer_to(tables[i, 3]),
+                    pointer_to(tables[i, 4]),
+                    pointer_to(tables[i, 5]),
+                    pointer_to(tables[i, 6]),
+                    pointer_to(tables[i, 7]),
+                    pointer_to(tables[i, 8]),
+                    pointer_to(tables[i, 9]),
+                    pointer_to(tables[i, 10]),
+                    pointer_to(tables[i, 11]),
+                    pointer_to(tables[i, 12]),
+                    pointer_to(tables[i, 13]),
+                    pointer_to(tables[i, 14]),
+                    states,
+                    used[i],
+                    received_columns[i],
+                    table,
+                ),
+            )
+        # The tick that follows.
+        for lane in range(LANES):
+            clock[0, 0, lane] += 1
+        running = keep_ended_runs(
+            ticks=clock[0, 0],
+            runs=runs,
+            mode_word=mode_word,
+            bucket=0,
+            record_row=0,
+            peaks=peaks,
+            present=present,
+            ended=ended,
+        )
+        for lane in range(runs):
+            if ended.ticks[lane] == clock[0, 0, lane]:
+                copy_lane(lane, present.links, ended.links)
+    return running
+
+
+class LaneEpisodes(LaneRun):
+    """Runs of one structure, each in a lane, that begin and end at different times.
+
+    Args:
+        run: Any run of this structure before its first tick, see `explain_run`.
+        count: Number of lanes with a run, at most `LANES`.
+        hand_site: Index of the site whose arm a program moves.
+        hand_row: Index of its live operator among the operators of the site.
+        period_ticks: Time from one decision of the program to the next, ticks.
+
+    Attributes:
+        ticks: Number of ticks that each run has made, shape (LANES,).
+        hands: The program's hand in each lane.
+        structure: The structure, see `find_structure`.
+        most_runs: Largest number of lanes with a run.
+        least_runs: Number of runs from which lanes are faster than one run after the other.
+    """
+
+    clock = _CLOCK
+    most_runs = LANES
+    least_runs = LEAST_RUNS
+
+    def __init__(
+        self, run: FusedRun, count: int, *, hand_site: int, hand_row: int, period_ticks: int
+    ) -> None:
+        super().__init__([run] * count)
+        self.structure = self.find_structure(run)
+        self.ticks = np.zeros(LANES, np.int64)
+        self.hands = SeveralHands(LANES, BLOCK_TICKS, self._rate_hz, period_ticks)
+        self._hand_site = hand_site
+        self._clock_words = allocate_words(2, 1)
+        self._clock_addresses = np.array([row.ctypes.data for row in self._clock_words])
+        most_sources = len(self._actors) // self._sites
+        self._hand_row = hand_site * most_sources + hand_row
+        words = [*find_words(self._layout.actor, "grip")]
+        for name in ("a", "b"):
+            words += [*find_words(self._layout.actor, name)][: SeveralHands.axes]
+        self._action_words = np.array(words)
+        self._used_before = np.full(self._used.shape[:3], -1)
+        self._span_first = self.ticks.copy()
+        self._widen_peaks(1)
+        self._table_addresses = self._find_tables()
+
+    @staticmethod
+    def find_structure(run: FusedRun) -> RunStructure:
+        """Returns what the runs must have in common. They may end at different times."""
+        return find_structure(run)._replace(duration_s=0.0)
+
+    @staticmethod
+    def explain_hand(rules: HandRules, period_ticks: int, largest_action: float) -> str:
+        """Explains why the steps of a program cannot be computed in lanes, or returns "".
+
+        Args:
+            rules: Limits of the program's hand.
+            period_ticks: Number of ticks of a step.
+            largest_action: Largest absolute value of a number of an action.
+        """
+        if period_ticks > BLOCK_TICKS:
+            return f"steps of more than {BLOCK_TICKS} ticks"
+        return SeveralHands.explain(rules, period_ticks, largest_action)
+
+    @staticmethod
+    def explain_run(run: FusedRun, hand_site: int) -> str:
+        """Explains why a run cannot be computed in lanes, or returns "".
+
+        The code is compiled for this answer.
+
+        Args:
+            run: The run before its first tick.
+            hand_site: Index of the site whose arm a program moves.
+        """
+        obstacle = find_obstacle(run, hand_site=hand_site)
+        return obstacle or explain_uncompilable(run, _CLOCK)
+
+    def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
+        """Puts a run into a lane, in place of the run that was there.
+
+        Args:
+            lane: The lane.
+            run: The run before its first tick, of the same structure as the others.
+            rules: Limits of the program's hand, see `HandRules`.
+        """
+        memory = run.memory
+        tables = memory.tables
+        pairs: list[tuple[Words, NDArray[Any]]] = [
+            (self._site, tables.site),
+            (self._links, tables.links),
+            (self._actors, tables.actors),
+            (self._environments, tables.actors),
+            (self._sums, memory.sums),
+            (self._progress, memory.progress),
+            (self._ramps, view_rows(tables.ramps)),
+        ]
+        for words, rows in pairs:
+            words[:, :, lane] = read_words(rows.reshape(-1))
+        if memory.laws is not None:
+            self._laws[:, :, lane] = memory.laws.rows.view(np.int64)
+            self._sent[:, :, lane] = memory.laws.sent.view(np.int64)
+        self._received[:, :, lane] = 0
+        self.ticks[lane] = 0
+        self._ended.ticks[lane] = -1
+        self._put_first_states(lane, tables)
+        self._load_links(lane, run)
+        self.hands.begin(lane, rules)
+        self.runs[lane] = run
+
+    def _load_links(self, lane: int, run: FusedRun) -> None:
+        """Puts the links of a run into a lane, and makes room for them if necessary."""
+        tables = run.memory.tables
+        links = self._deliveries
+        pages = tables.calendars.shape[2]
+        # A sample that is sent in a span waits at most as long as the calendar has pages.
+        needed = 1 << (pages + BLOCK_TICKS).bit_length()
+        old_room = links.releases.shape[3]
+        if needed > old_room:
+            releases = np.full((*links.releases.shape[:3], needed), -1)
+            for other in range(len(self.runs)):
+                due = np.arange(self.ticks[other], self.ticks[other] + old_room)
+                releases[other, ..., due % needed] = links.releases[other, ..., due % old_room]
+            links = links._replace(releases=releases)
+        models = tables.models.shape[2]
+        if models > links.models.shape[3]:
+            wider = np.zeros((*links.models.shape[:3], models), LINK_MODEL_DTYPE)
+            wider[..., : links.models.shape[3]] = links.models
+            links = links._replace(models=wider)
+        points = len(tables.points)
+        if points > links.points.shape[1]:
+            more = np.zeros((len(links.points), points, 2), np.int64)
+            more[:, : links.points.shape[1]] = links.points
+            links = links._replace(points=more)
+        links.links[lane] = tables.links
+        links.models[lane, ..., :models] = tables.models
+        links.points[lane, :points] = tables.points
+        links.releases[lane] = -1
+        links.newest[lane] = -1
+        self._deliveries = links
+
+    def advance(
+        self,
+        count: int,
+        *,
+        is_idle: NDArray[np.bool_],
+        acts: NDArray[np.bool_],
+        goals: Array,
+        locate: Callable[[Array], Array],
+    ) -> None:
+        """Steps the runs through a span of ticks. A run ends if an arm of it leaves its limits.
+
+        Args:
+            count: Number of ticks, at most `BLOCK_TICKS`.
+            is_idle: True for runs that are not advanced, shape (runs,). Their numbers have no
+                meaning afterwards, unless they have ended.
+            acts: True for runs in which a decision of the program begins to act at the first
+                tick, shape (runs,).
+            goals: These decisions, shape (runs, 2).
+            locate: Function that returns the poses of the arm, shape (runs, 2), from its joint
+                angles, shape (runs, 2), in the coordinates of the program.
+        """
+        runs = len(self.runs)
+        idle = np.ones(LANES, np.int64)
+        idle[:runs] = is_idle | self.has_ended
+        acting = np.zeros(LANES, np.int64)
+        acting[:runs] = acts
+        all_goals = np.zeros((LANES, SeveralHands.axes))
+        all_goals[:runs] = goals
+        poses = np.zeros_like(all_goals)
+        begins = (acting != 0) & (self.hands.arrays.holds == 0) & (idle == 0)
+        if begins.any():
+            poses[:runs] = locate(self.read_site("q")[self._hand_site])
+        self.hands.advance(
+            runs,
+            self.ticks,
+            count,
+            is_idle=idle,
+            acts=acting,
+            goals=all_goals,
+            poses=poses,
+        )
+        self._step_span(count, idle)
+
+    def _step_span(self, count: int, idle: IntArray) -> None:
+        """Steps the runs through a span of ticks, with the actions of their programs.
+
+        Args:
+            count: Number of ticks.
+            idle: 1 for lanes that are not advanced.
+        """
+        span = np.maximum(self.ticks - 1 - self._span_first, 0)
+        lanes = np.arange(LANES)
+        self._used_before[:] = self._used[:, :, lanes, span]
+        self._used_before[:, :, self.ticks == 0] = -1
+        self._span_first[:] = self.ticks
+        age = _use_samples_of_lanes(
+            runs=len(self.runs),
+            first=self.ticks,
+            count=count,
+            rate_hz=self._rate_hz,
+            skipped=np.where(idle, 0, -1),
+            states=self._deliveries,
+            draws=self._draws,
+            used=self._used,
+        )
+        self._keep_states(age)
+        site_fields: Any = self._layout.site.fields
+        _, mode_offset = site_fields["mode"]
+        _run_span(
+            first=self.ticks,
+            count=count,
+            rate_hz=self._rate_hz,
+            runs=len(self.runs),
+            settled_rad=self._structure.settled_rad,
+            pages=self._pages,
+            mode_word=mode_offset // 8,
+            addresses=self._addresses,
+            tables=self._table_addresses,
+            clock=self._clock_words,
+            clock_addresses=self._clock_addresses,
+            actions=self.hands.actions,
+            hand_row=self._hand_row,
+            columns=self._action_words,
+            actors=self._actors.view(np.float64),
+            states=self._states,
+            used=self._used,
+            received_columns=self._columns,
+            table=self._table,
+            peaks=self._peaks,
+            present=self._list_present(),
+            ended=self._ended,
+        )
+        self.ticks[idle == 0] += count
+
+    def _keep_states(self, ticks: int) -> None:
+        """Makes room for the states of more ticks; each lane has a tick of its own."""
+        while self._pages <= ticks:
+            old_pages = self._pages
+            self._pages *= 2
+            states = np.zeros((self._sites, self._pages + 1, *self._states.shape[2:]))
+            for lane in range(len(self.runs)):
+                kept = np.arange(max(self.ticks[lane] - old_pages, 0), self.ticks[lane])
+                states[:, kept % self._pages, lane] = self._states[:, kept % old_pages, lane]
+            states[:, -1] = self._states[:, -1]
+            self._states = states
+
+    @property
+    def has_ended(self) -> NDArray[np.bool_]:
+        """True for runs that ended because an arm left its limits, shape (runs,)."""
+        return self._ended.ticks[: len(self.runs)] >= 0
+
+    def read_site(self, name: str) -> NDArray[Any]:
+        """Returns a field of the rows of all sites, shape (N, runs, numbers)."""
+        dtype: Any = self._layout.site.fields[name][0]  # type: ignore[index]
+        return self._read(self._site, self._ended.site_rows, self._layout.site, name, dtype)
+
+    def read_links(self, name: str, i: int) -> NDArray[Any]:
+        """Returns a field of the rows of the links of site `i`, shape (P, runs, numbers)."""
+        dtype: Any = self._layout.link.fields[name][0]  # type: ignore[index]
+        rows = slice(i * self._structure.peers, (i + 1) * self._structure.peers)
+        return self._read(
+            self._links[rows], self._ended.links[rows], self._layout.link, name, dtype
+        )
+
+    def _read(
+        self,
+        present: Words,
+        ended: Words,
+        layout: np.dtype[Any],
+        name: str,
+        dtype: np.dtype[Any],
+    ) -> NDArray[Any]:
+        """Returns a field of rows, from `ended` for the runs that have ended."""
+        words = find_words(layout, name)
+        columns = slice(words.start, words.stop)
+        runs = len(self.runs)
+        numbers = present[:, columns, :runs]
+        has_ended = self.has_ended
+        if has_ended.any():
+            numbers = np.where(has_ended, ended[:, columns, :runs], numbers)
+        in_order = np.ascontiguousarray(numbers.transpose(0, 2, 1))
+        return in_order.view(dtype.base)
+
+    def read_new(self, i: int) -> NDArray[np.bool_]:
+        """Returns which samples site `i` uses since its latest tick, shape (P, runs)."""
+        runs = len(self.runs)
+        lanes = np.arange(runs)
+        ticks = np.where(self.has_ended, self._ended.ticks[:runs], self.ticks[:runs])
+        row = np.maximum(ticks - 1 - self._span_first[:runs], 0)
+        used = self._used[i][:, lanes, row]
+        earlier = self._used[i][:, lanes, np.maximum(row - 1, 0)]
+        before = np.where(row > 0, earlier, self._used_before[i][:, :runs])
+        is_new: NDArray[np.bool_] = used > before
+        return is_new
+
+    def write_back(self, lane: int) -> None:
+        """Writes the state of the sites and of the samples in use into the run of a lane.
+
+        The run cannot continue alone from there: its links still have their first state.
+
+        Args:
+            lane: The lane.
+        """
+        memory = self.runs[lane].memory
+        has_ended = bool(self.has_ended[lane])
+        sites = self._ended.site_rows if has_ended else self._site
+        links = self._ended.links if has_ended else self._links
+        put_rows(memory.tables.site, sites[:, :, lane])
+        put_rows(memory.tables.links, links[:, :, lane])
+        if has_ended:
+            last_ns = tick_ns(int(self._ended.ticks[lane]) - 1, self._rate_hz)
+            memory.progress["diverged_ns"][0] = last_ns
+
+
+def find_words(layout: np.dtype[Any], name: str) -> range:
+    """Returns the words of a field in a row."""
+    fields: Any = layout.fields
+    dtype, offset, *_ = fields[name]
+    return range(offset // 8, (offset + dtype.itemsize) // 8)
