@@ -61,3 +61,12 @@ def test_urdf_files_state_limits_of_real_arms(key: str, tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, CHAIN, key)
     with pytest.raises(ScenarioError, match=f"<limit {FILE_KEYS[key]}=...> in its URDF"):
         check_outside_arms(scenario)
+
+
+@pytest.mark.parametrize("action", ["use", "hold", "brake"])
+def test_real_arms_keep_limits_and_change_rule(action: str) -> None:
+    """A rule that a real arm cannot have is the wrong key, and not the limits of the arm."""
+    text = PLANAR.read_text(encoding="utf-8")
+    with pytest.raises(ScenarioError, match="an external arm needs 'glide'") as caught:
+        parse_scenario(text.replace('action = "glide"', f'action = "{action}"'))
+    assert caught.value.path == "sites.s.on_stale.action"

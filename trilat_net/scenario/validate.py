@@ -192,14 +192,24 @@ def check_outside_arms(scenario: Scenario) -> None:
                 )
         for key in _ASSUMED_LIMITS:
             _refuse_assumed_limit(scenario, name, key)
-        if site.on_stale.action != "glide":
-            raise ScenarioError(
-                f"is {site.on_stale.action!r}, but an external arm needs 'glide', so that its "
-                "site waits, holds and stops without a jump "
-                f"({find_page('silent-peers.md')})",
-                path=f"sites.{name}.on_stale.action",
-                source=scenario.name,
-            )
+        _refuse_jumping_arm(scenario, name)
+
+
+def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
+    """Refuses a real robot whose stale rule lets its reference jump.
+
+    Args:
+        scenario: Description of the experiment.
+        name: Name of the site with the robot.
+    """
+    action = scenario.sites[name].on_stale.action
+    if action != "glide":
+        raise ScenarioError(
+            f"is {action!r}, but an external arm needs 'glide', so that its site waits, holds "
+            f"and stops without a jump ({find_page('silent-peers.md')})",
+            path=f"sites.{name}.on_stale.action",
+            source=scenario.name,
+        )
 
 
 def refuse_live_only(scenario: Scenario) -> None:
@@ -596,6 +606,8 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
+            if name in scenario.outside:
+                _refuse_jumping_arm(scenario, name)  # the limits of a real robot must stay
             raise ScenarioError(
                 "applies only with on_stale.action = 'glide', but the action is "
                 f"{site.on_stale.action!r}",
