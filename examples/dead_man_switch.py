@@ -3,7 +3,11 @@
     python examples/dead_man_switch.py two_sites s --connect tcp/127.0.0.1:10241
     pedal | python examples/dead_man_switch.py two_sites s --connect tcp/127.0.0.1:10241
 
-Instead of a key, a program such as `pedal` can write lines while the arm may move.
+Instead of a key, a program such as `pedal` can write lines while the arm may move. The state of
+a ROS robot, which an emergency stop makes false, does so in place of `pedal` with --gap-s 0.1:
+
+    PYTHONUNBUFFERED=1 ros2 topic echo /robot/enabled | grep -i --line-buffered true |
+        python examples/dead_man_switch.py two_sites s --connect tcp/127.0.0.1:10241 --gap-s 0.1
 
 A terminal does not report that a key was released, but it repeats a key that is held down. The
 switch is therefore released when nothing has arrived for --gap-s. This time must be longer than

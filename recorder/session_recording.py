@@ -699,8 +699,11 @@ class Recording:
         )
         if account.refilled:
             line += f", {account.refilled} from its memory"
-        if account.unpublished:
-            line += f", {account.unpublished} not made while it was away"
+        if site.skipped_ticks:
+            line += f", {site.skipped_ticks} skipped"
+        not_made_away = account.unpublished - site.skipped_ticks
+        if not_made_away:
+            line += f", {not_made_away} not made while it was away"
         return line
 
     def describe_problem(self) -> str | None:

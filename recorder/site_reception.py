@@ -203,6 +203,8 @@ class SiteReception:
         accounts: Counts of the messages of each channel. Records and statistics are counted
             over all starts. Events are counted from 0 for every start.
         event_accounts: Counts of the events of the previous starts.
+        skipped_ticks: Number of ticks that the site skipped, over all starts. The account of
+            the records counts these ticks as unpublished.
         final_ticks: Number of ticks that the site executed. None until its "end" event arrives.
         last_received_ns: Arrival of the last message on the monotonic clock, in ns. None before
             the first message.
@@ -222,10 +224,12 @@ class SiteReception:
         self._before = before
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self.event_accounts: tuple[Account, ...] = ()
+        self.skipped_ticks = 0
         self.since_ns: float = math.inf
         if before is not None:
             self.accounts = {**before.accounts, topics.EVENT: Account()}
             self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
+            self.skipped_ticks = before.skipped_ticks
             self.since_ns = before.since_ns
         self.final_ticks: int | None = None
         self.last_received_ns: int | None = None
@@ -519,8 +523,13 @@ class SiteReception:
         if not skipped:
             return
         for channel in (topics.STATE, topics.LINK):
-            numbers = skipped_numbers(channel, record.tick, skipped, self._rate_hz)
-            self.accounts[channel].mark_unpublished(*numbers)
+            next_number, published = skipped_numbers(
+                channel, record.tick, skipped, self._rate_hz
+            )
+            account = self.accounts[channel]
+            lowest_unpublished = account.mark_unpublished(next_number, published)
+            if channel == topics.STATE:
+                self.skipped_ticks += next_number - lowest_unpublished
 
     def _begin_start(self, first_tick: int) -> None:
         """Counts the messages between the previous start of the site and this one.

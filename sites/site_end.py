@@ -60,6 +60,30 @@ class RunOutcome(NamedTuple):
         return -1 if self.output is None else self.output.t_ns
 
 
+def _summarise_loop(ticks: int, parts: SiteParts) -> str:
+    """Returns the sentence about the ticks and the dropped messages of a site at its end.
+
+    Args:
+        ticks: Number of the last tick plus 1.
+        parts: Parts of the site.
+    """
+    stats = parts.stats
+    text = f"{count_nouns(ticks, 'tick')}, {stats.late_ticks} of them late by a period or more"
+    if stats.skipped:
+        text += f", {stats.skipped} of them skipped"
+    if not stats.dropped:
+        return text
+    scenario = parts.scenario
+    skipping = [peer for peer in scenario.peers(parts.name) if peer in scenario.external]
+    counts = []
+    for reason, count in stats.dropped.items():
+        counts.append(f"{count} {reason}")
+        # Samples carry no word about skipped ticks, so that a receiver sees only their gap.
+        if reason == "missing" and skipping:
+            counts[-1] += f" (lost, or ticks that {' or '.join(skipping)} skipped)"
+    return f"{text}; dropped: {', '.join(counts)}"
+
+
 class SiteEnd:
     """The end of a site, from the last tick of its control loop to the end of its process.
 
@@ -105,12 +129,7 @@ class SiteEnd:
         if topics.RECORDER in monitor.boots or monitor.recorders:
             self._await_recorders()
         ticks = count_nouns(self._outcome.ticks, "tick")
-        summary = f"{ticks}, {parts.stats.overruns} of them late by a period or more"
-        dropped_counts = parts.stats.dropped.items()
-        if dropped_counts:
-            dropped = ", ".join(f"{count} {reason}" for reason, count in dropped_counts)
-            summary += f"; dropped: {dropped}"
-        parts.say(summary)
+        parts.say(_summarise_loop(self._outcome.ticks, parts))
 
         if self._outcome.failure is not None:
             raise self._outcome.failure

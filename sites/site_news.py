@@ -237,9 +237,12 @@ class SiteNews:
         torque_nm = max(map(abs, output.tau))
         dropped = sum(parts.stats.dropped.values())
 
+        late = f"{count_nouns(parts.stats.late_ticks, 'tick')} late"
+        if parts.stats.skipped:
+            late += f", {parts.stats.skipped} skipped"
+
         return (
             f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, "
             f"|e| {largest_error:.3g} {unit}, torque {torque_nm:.3g} N m, "
-            f"{count_nouns(parts.stats.overruns, 'tick')} late, "
-            f"{count_nouns(dropped, 'message')} dropped"
+            f"{late}, {count_nouns(dropped, 'message')} dropped"
         )

@@ -38,6 +38,7 @@ OUTSIDE = [
         "arm.known": "false",
         "on_stale.action": "glide",
         "on_stale.align_limit_rad": "4",
+        "limits.tau_limit_nm": "150",
         "limits.tau_rate_limit_nm_s": "5000",
         "limits.qd_des_limit_rad_s": "5",
         "limits.q_min_rad": "-6.3",

@@ -185,10 +185,10 @@ def test_shipped_arms_have_their_makers_data() -> None:
     ],
 )
 def test_mistakes_are_refused_at_their_key(changes: Overrides, path: str, phrase: str) -> None:
-    """A value of a wrong type or range has the key as written, and other mistakes their site."""
+    """A wrong value or URDF file has the key as written, and other mistakes have their site."""
     error = refusal(changes)
-    is_wrong_value = error.problem.startswith("expected ")
-    key = path if is_wrong_value and "sites" not in str(changes) else f"sites.m1.{path}"
+    is_of_all_sites = error.problem.startswith("expected ") or path == "arm.urdf"
+    key = path if is_of_all_sites and "sites" not in str(changes) else f"sites.m1.{path}"
     assert (error.path, phrase in error.problem) == (key, True), error
 
 

@@ -148,7 +148,7 @@ def test_side_links_never_make_arms_unusable(
 def test_a_finger_as_end_link_is_refused() -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(FINGER, {})
-    assert refused.value.path == "sites.m.arm.urdf"
+    assert refused.value.path == "arm.urdf"
     for word in (
         "'finger'",
         "arm.balance_inertia = true",

@@ -505,3 +505,17 @@ def test_threads_may_be_the_first_readers_together() -> None:
         ).returncode
         == 0
     )
+
+
+@pytest.mark.parametrize("table", ["arm", "sites.m.arm"])
+@pytest.mark.parametrize("content", ["", "<robot", "<robot name='r'/>"])
+def test_errors_of_urdf_files_name_the_written_table(
+    table: str, content: str, tmp_path: Path
+) -> None:
+    """A file that cannot be read or used is named by the table in which its name stands."""
+    text = read_shipped("two_sites")
+    if content:
+        (tmp_path / "mine.urdf").write_text(content, encoding="utf-8")
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(text, "", {f"{table}.urdf": "mine.urdf"}, tmp_path)
+    assert caught.value.path == f"{table}.urdf"

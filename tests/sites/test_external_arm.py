@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,9 +22,12 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
+from tests.analysis.logs import rewritten
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six
+from trilat_net.analysis.file_overview import info, summarise_run
+from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
@@ -33,9 +37,10 @@ from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient, SwitchClient
 from trilat_net.net.bus import Bus, StampingRing
-from trilat_net.net.messages import VERSION, Event
+from trilat_net.net.messages import VERSION, Event, State
 from trilat_net.net.requests import ArmEnable, ArmMeasurement
 from trilat_net.net.wire import encode
+from trilat_net.presentation.page_sites import render_loops
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
@@ -241,6 +246,48 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     assert np.abs(np.diff(part.tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log["m"].mode[-1] in ("run", "hold", "return")
     whole(log)
+
+
+def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
+    """Ticks that a late site skipped are named as skipped by sites, recorder, file and links."""
+    scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 1.5})
+    session = Session.whole(scenario, tmp_path, ends={})
+    session.stranger(driving([], []), at_ns=A_SECOND + 200_250_000)
+    session.clocks["s"].stall(2 * A_SECOND, A_SECOND // 100)
+    log = session.run()
+    skipped = log["s"].skipped
+    assert skipped > 0
+    assert log.absent_ticks("s") == skipped
+    assert len(log["s"]) == 1500 - skipped
+
+    facts = info(*log.sources).facts
+    assert (facts["sites"]["m"]["skipped"], facts["sites"]["s"]["skipped"]) == (0, skipped)
+    assert not any(channel["missing"] for channel in facts["channels"].values())
+    for site in summarise_run(log)["sites"].values():
+        assert site["missing"] == 0
+    counts = {link.peer: link.counts for link in summarise_links(log)}
+    assert counts["s"] is not None
+    assert counts["s"].sent == len(log["s"])
+    assert counts["s"].missing == 0
+
+    summary = session.relay.results["recorder"]
+    assert isinstance(summary, list)
+    (of_recorder,) = [line for line in summary if line.startswith("recorder: s:")]
+    assert f", {skipped} skipped" in of_recorder
+    assert "not made" not in of_recorder
+    own = "of them late by a period or more"
+    assert any(f"{own}, {skipped} of them skipped" in line for line in session.said)
+    assert any(
+        f"{skipped} missing (lost, or ticks that s skipped)" in line for line in session.said
+    )
+
+    def delay(state: State) -> State:
+        return msgspec.structs.replace(state, late_us=1000 if state.tick in (7, 9) else 1)
+
+    late = rewritten(log, change=delay)
+    page = render_loops(late, summarise_run(late))
+    assert "; 4 ticks began a period or more late and were made all the same; " in page
+    assert f"{skipped} ticks were skipped." in page
 
 
 def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:

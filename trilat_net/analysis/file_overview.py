@@ -156,7 +156,8 @@ class FileInventory:
             session: Name of the session. Empty to count no missing messages.
             rates_hz: Tick rates of the session's sites, the processes that run one arm each, by
                 name.
-            absences: Ticks in which sites were absent from the session. They are not missing.
+            absences: Ticks in which sites were absent from the session, and ticks that
+                they skipped. They are not missing.
 
         Returns:
             Plain values by topic.
@@ -218,14 +219,14 @@ def _count_gaps(
     """Counts the messages that are missing from a channel, and those that it has twice.
 
     Only the records and the link statistics of a site have consecutive numbers. Ticks during
-    which the site was absent are not missing.
+    which the site was absent, or which the site skipped, are not missing.
 
     Args:
         topic: Topic of the channel.
         sequence: Tick of every message, in the order of the file.
         session: Name of the session.
         rates_hz: Tick rates of the session's sites.
-        absences: Ticks during which the sites were absent.
+        absences: Ticks that the sites did not execute.
 
     Returns:
         The number of missing messages, the gaps as spans of message numbers, and the number of
@@ -337,13 +338,13 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     }
     session = ""
     rates_hz = {}
-    absences = {}
+    absences: Absences = {}
     if SESSION in inventory.metadata:
         try:
             log = open_log(*paths, progress=report_pass(1))
             facts |= _describe_log(log)
             session = log.session["session"]
-            absences = log.absences
+            absences = {site: log.find_unexecuted_ticks(site) for site in log.sites}
             rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
         except LogError as error:
             facts["problem"] = str(error)
@@ -450,6 +451,7 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
         "late_us": _compute_percentiles(part.late_us) if is_timed else None,
         "busy_us": _compute_percentiles(part.busy_us) if is_timed else None,
         "overruns": _count_overruns(part) if is_timed else None,
+        "skipped": part.skipped,
     }
 
 
@@ -656,7 +658,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         "records": len(part),
         "expected_ticks": expected,
         "made_ticks": executed,
-        "missing": max(0, ticks - len(part)),
+        "missing": max(0, ticks - log.absent_ticks(site) - len(part)),
         "diverged_at_s": part.diverged_s,
         "modes": [interval._asdict() for interval in find_mode_intervals(part)],
         "q_end_rad": part.q[-1].tolist() if len(part) else None,
@@ -668,6 +670,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         "late_us": late_us or dict.fromkeys(_LATENESS_PERCENTILES),
         "busy_us": busy_us or dict.fromkeys(PERCENTILES),
         "overruns": _count_overruns(part),
+        "skipped": part.skipped,
         "hands_moved_max_rad": moved_max_rad,
         "hands_moved_end_rad": moved_end_rad,
     }

@@ -627,8 +627,10 @@ def _summarise_link(
     # losses, and bursts of successive losses
     first = arrivals.first
     is_judged = _mark_judged_samples(log, site, delivery.stamp_ns, first)
-    for first_skipped, last_skipped in log.absences.get(peer, ()):
-        is_judged[first_skipped : last_skipped + 1] = False  # the peer sent none of these
+    is_sent = np.ones(len(is_judged), dtype=np.bool_)
+    for first_tick, last_tick in log.find_unexecuted_ticks(peer):
+        is_sent[max(first_tick, 0) : last_tick + 1] = False
+    is_judged &= is_sent
     has_not_arrived = np.ones(len(is_judged), dtype=np.bool_)
     has_not_arrived[first.sample] = False
     is_lost = (has_not_arrived | delivery.lost) & is_judged
@@ -658,6 +660,7 @@ def _summarise_link(
             used=used,
             delivery=delivery,
             arrivals=arrivals,
+            sent=int(np.count_nonzero(is_sent)),
             judged=judged,
         )
         if log.driver == "live" and part.record(0).v >= ONE_WAY_SCHEMA_VERSION:
@@ -684,6 +687,7 @@ def _count_samples(
     used: Ints,
     delivery: _PredictedDelivery,
     arrivals: _Arrivals,
+    sent: int,
     judged: int,
 ) -> SampleCounts:
     """Counts the samples of a link by what happened to them, see `SampleCounts`.
@@ -693,6 +697,7 @@ def _count_samples(
         used: Number of the sample in use at every record, shape (K,).
         delivery: Predicted delivery of all samples.
         arrivals: Arrivals over the link.
+        sent: Number of samples that the peer sent.
         judged: Number of samples of which it is known whether they arrived.
     """
     first = arrivals.first
@@ -708,7 +713,7 @@ def _count_samples(
     is_superseded = ~is_lost & is_recorded & (used[row] != first.sample)
 
     return SampleCounts(
-        sent=len(delivery.stamp_ns),
+        sent=sent,
         judged=judged,
         arrived=len(first.sample),
         missing=judged - len(first.sample),

@@ -635,17 +635,28 @@ class Log(Result, Mapping[str, SiteLog]):
                 absences.append((absence_begin, start_tick - 1))
         return absences
 
-    def absent_ticks(self, site: str) -> int:
-        """Counts the ticks that a site did not execute, although the session was running.
+    def find_unexecuted_ticks(self, site: str) -> list[tuple[int, int]]:
+        """Finds the ticks that a site did not execute, although the session was running.
 
         These are the ticks between two starts of the site (`absences`), and the ticks that the
-        site skipped because it was late, as its records state.
+        site skipped because it was late, as its records state. The site published nothing in
+        these ticks, so that neither records nor samples of these ticks are missing.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The ranges, as (first tick, last tick).
+        """
+        return [*self.absences.get(site, ()), *self[site].skipped_ranges]
+
+    def absent_ticks(self, site: str) -> int:
+        """Counts the ticks of `find_unexecuted_ticks`.
 
         Args:
             site: Name of the site.
         """
-        between = sum(last - first + 1 for first, last in self.absences.get(site, ()))
-        return between + self[site].skipped
+        return sum(last - first + 1 for first, last in self.find_unexecuted_ticks(site))
 
     def expected_ticks(self, site: str) -> int:
         """Returns the number of ticks that a site should have executed in this run.

@@ -579,7 +579,20 @@ class SiteLog:
 
         Only a site with an external arm skips ticks: a real arm cannot catch up.
         """
-        return sum(count_skipped_ticks(texts) for texts in self._changes.values())
+        return sum(last - first + 1 for first, last in self.skipped_ranges)
+
+    @property
+    def skipped_ranges(self) -> list[tuple[int, int]]:
+        """Ranges of skipped ticks, as (first tick, last tick), in ascending order.
+
+        The record after a range states how many ticks the site skipped before it.
+        """
+        ranges = []
+        for next_tick, texts in sorted(self._changes.items()):
+            skipped = min(count_skipped_ticks(texts), next_tick)
+            if skipped:
+                ranges.append((next_tick - skipped, next_tick - 1))
+        return ranges
 
     mode = _RecordField(
         _read_objects,

@@ -215,7 +215,8 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         dropped: messages that were none of ours or overflowed, by reason.
         late_max_us: largest lateness of a wake-up since the last statistics.
         busy_max_us: largest computing time of a tick since then.
-        overruns: ticks since the start whose work began after the next one was due.
+        overruns: ticks since the start whose work began after the next one was due,
+            or that were skipped.
         offset_us: per peer, its clock minus the own one, as in force.
         bound_us: per peer, how far that is from the truth at most.
         delay_us: per peer, one-way delay: median since the last statistics; -1 where nothing came.

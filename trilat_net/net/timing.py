@@ -789,6 +789,7 @@ class LoopStats:
         dropped: Number of messages that were dropped since the start, by reason.
         overruns: Number of ticks (periods of the control loop) since the start that began after
             the next tick was due, or that were skipped.
+        skipped: Number of ticks since the start that were skipped.
     """
 
     def __init__(self, site: Site, boot: int) -> None:
@@ -801,6 +802,12 @@ class LoopStats:
         self._busy_max_us = 0
         self.dropped: Counter[str] = Counter()
         self.overruns = 0
+        self.skipped = 0
+
+    @property
+    def late_ticks(self) -> int:
+        """Number of ticks that were executed, but began after the next tick was due."""
+        return self.overruns - self.skipped
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
         """Updates the statistics with one tick.
@@ -815,6 +822,7 @@ class LoopStats:
                 tick.
         """
         self.overruns += skipped
+        self.skipped += skipped
         if late_us > self._late_max_us:
             self._late_max_us = late_us
         if busy_us > self._busy_max_us:

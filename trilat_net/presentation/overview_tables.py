@@ -120,10 +120,11 @@ def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
             ticks,
             site["missing"],
             site["overruns"],
+            site["skipped"],
         ]
         rows.append(row)
-    headers = ("site", "role", "rate Hz", "records", "of", "missing", "overruns")
-    yield from _tabulate(headers, rows, text_columns=2)
+    columns = "site, role, rate Hz, records, of, missing, overruns, skipped"
+    yield from _tabulate(columns.split(", "), rows, text_columns=2)
 
     if any(site["late_us"] for site in sites.values()):
         loops = []

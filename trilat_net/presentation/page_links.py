@@ -43,7 +43,10 @@ _AGE_COLUMNS = {
 _AGE_KEYS = ("mean", "deviation", "p50", "p99", "min", "max")
 _SAMPLE_COLUMNS = {
     "sent": ("sent", "samples that the sender published"),
-    "missing": ("missing on the way", "samples that the network did not deliver"),
+    "missing": (
+        "missing on the way",
+        "samples that were sent, but that the network did not deliver",
+    ),
     "lost": ("lost by the model", "samples that the delay model lost"),
     "late": ("late", "samples that arrived after the model's delay had passed"),
     "superseded": ("superseded", "never used, because a newer sample came into use before"),

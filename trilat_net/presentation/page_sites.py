@@ -96,7 +96,10 @@ _LOOP_COLUMNS = {
     "busy p50 (µs)": "median computing time of a tick",
     "busy p99 (µs)": "value that 99 % of the ticks do not exceed",
     "busy max (µs)": "largest value",
-    "overruns": "ticks that were skipped, because their loop was too late",
+    "overruns": "ticks that began late by a period or more, and were made all the same: a "
+    "simulated arm catches up",
+    "skipped": "ticks that were not made: a site with an external arm skips the ticks that it "
+    "missed",
 }
 
 
@@ -115,20 +118,24 @@ def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mark
         return render_section("Loop timing", f"Not measured: {reason}.", Markup(), "loops")
     rows = []
     overruns = 0
+    skipped = 0
     worst_us = 0.0
     for name in log.sites:
         site: JsonObject = facts["sites"][name]
         late = site["late_us"]
         values = [late[key] for key in ("p50", "p99", "p99_9", "max")]
         values += [site["busy_us"][key] for key in ("p50", "p99", "max")]
-        values.append(site["overruns"])
+        values += [site["overruns"], site["skipped"]]
         cells = [NO_NUMBER if value is None else f"{value:.0f}" for value in values]
         rows.append([label_site(log, name), *cells])
         overruns += site["overruns"] or 0
+        skipped += site["skipped"]
         worst_us = max(worst_us, late["max"] or 0.0)
     intro = (
         f"The latest tick began {worst_us / 1e3:.3g} ms after it was due; "
-        f"{count_nouns(overruns, 'tick was', 'ticks were')} skipped."
+        f"{count_nouns(overruns, 'tick')} began a period or more late and "
+        f"{'was' if overruns == 1 else 'were'} made all the same; "
+        f"{count_nouns(skipped, 'tick was', 'ticks were')} skipped."
     )
     table = render_table(_LOOP_COLUMNS, rows) + render_legend(_LOOP_COLUMNS)
     body = render_details("Lateness and computing time, by loop", table) + charts

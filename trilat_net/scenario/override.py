@@ -403,8 +403,9 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
 
     The author may have set the key for all sites or links at once. For example, the path
     "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. Values of a
-    wrong type or range are wrong for every site or link. Other errors, such as a list of the
-    wrong length, may concern only the site that they name, so their paths stay.
+    wrong type or range are wrong for every site or link, and so is a URDF file that cannot be
+    used. Other errors, such as a list of the wrong length, may concern only the site that they
+    name, so their paths stay.
 
     Args:
         error: The error, with the path of the key of a single site or link. An index in square
@@ -415,10 +416,11 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
         The path of the written key. The path of the error if no such key was written.
     """
     path = error.path
-    if not error.problem.startswith(_WRONG_VALUE):
-        return path
     key, bracket, index = path.partition("[")
     group, *names = key.split(".")
+    is_urdf = names[1:] == ["arm", "urdf"]
+    if not (is_urdf or error.problem.startswith(_WRONG_VALUE)):
+        return path
     if (
         group not in ("links", "sites")
         or len(names) < 2

@@ -14,6 +14,7 @@ Invariant:
 """
 
 import functools
+import math
 import operator
 from collections.abc import Collection, Sequence
 from typing import Any, get_args
@@ -35,7 +36,7 @@ from .distributions import dotted_key
 from .expect import find_expect_problem
 from .operators import kernel_operators
 from .operators.program_hand import ProgramHand
-from .scenario_types import Change, OnStale, Scenario, SiteSpec
+from .scenario_types import Change, Limits, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
 """Ratio of a singular value to the largest one below which the direction counts as immobile."""
@@ -111,6 +112,54 @@ OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_m
 """Optional limits that become mandatory for a real robot."""
 
 
+_ASSUMED_LIMITS = {
+    "tau_limit_nm": ("efforts", "effort", "tau_limit_nm = 60.0"),
+    "qd_limit_rad_s": ("speeds", "velocity", "qd_limit_rad_s = 6.0"),
+}
+"""Limits that a scenario always has, because a simulated arm has defaults for them.
+
+For each key: the attribute of the arm with the limits of its URDF file, their attribute in the
+element `<limit>` of that file, and an example.
+"""
+
+
+def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
+    """Refuses a limit of a real robot that neither the author nor the URDF file stated.
+
+    A complete scenario contains the defaults as if its author had written them. A limit counts
+    as assumed if it equals the default, a single number for the planar arm, or in a list of the
+    URDF file's limits at a joint for which the file states none.
+
+    Args:
+        scenario: Description of the experiment.
+        name: Name of the site with the robot.
+        key: Key of the limit.
+
+    Raises:
+        ScenarioError: The limit is assumed.
+    """
+    attribute, file_attribute, example = _ASSUMED_LIMITS[key]
+    default = getattr(Limits(), key)
+    limit = getattr(scenario.sites[name].limits, key)
+    arm = scenario.arms[name]
+    assumed: Any = default
+    if arm.chain is not None:
+        stated = getattr(arm, attribute)
+        assumed = [number if 0.0 < number < math.inf else default for number in stated]
+        if assumed == list(stated):
+            return
+    if not np.array_equal(limit, assumed):
+        return
+    alternative = f", or as <limit {file_attribute}=...> in its URDF file"
+    raise ScenarioError(
+        f"is missing: {default:g} is the default of simulated arms, and nobody has stated it "
+        f"of this external arm: write its own limit, as in {example}"
+        f"{alternative if arm.chain is not None else ''}",
+        path=f"sites.{name}.limits.{key}",
+        source=scenario.name,
+    )
+
+
 def check_outside_arms(scenario: Scenario) -> None:
     """Refuses real robots that lack limits, or whose reference could jump.
 
@@ -139,14 +188,26 @@ def check_outside_arms(scenario: Scenario) -> None:
                     path=f"sites.{name}.limits.{key}",
                     source=scenario.name,
                 )
-        if site.on_stale.action != "glide":
-            raise ScenarioError(
-                f"is {site.on_stale.action!r}, but an external arm needs 'glide', so that its "
-                "site waits, holds and stops without a jump "
-                f"({find_page('silent-peers.md')})",
-                path=f"sites.{name}.on_stale.action",
-                source=scenario.name,
-            )
+        for key in _ASSUMED_LIMITS:
+            _refuse_assumed_limit(scenario, name, key)
+        _refuse_jumping_arm(scenario, name)
+
+
+def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
+    """Refuses a real robot whose stale rule lets its reference jump.
+
+    Args:
+        scenario: Description of the experiment.
+        name: Name of the site with the robot.
+    """
+    action = scenario.sites[name].on_stale.action
+    if action != "glide":
+        raise ScenarioError(
+            f"is {action!r}, but an external arm needs 'glide', so that its site waits, holds "
+            f"and stops without a jump ({find_page('silent-peers.md')})",
+            path=f"sites.{name}.on_stale.action",
+            source=scenario.name,
+        )
 
 
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:
@@ -518,6 +579,8 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
+            if name in scenario.outside:
+                _refuse_jumping_arm(scenario, name)  # the limits of a real robot must stay
             raise ScenarioError(
                 "applies only with on_stale.action = 'glide', but the action is "
                 f"{site.on_stale.action!r}",

@@ -86,6 +86,12 @@ SAFE_PERIOD_NS = 10_000_000
 """Time between two safe commands to a robot, in ns."""
 DRIVE_PERIOD_S = 0.001
 """Time between two checks for a new torque, in s."""
+NOTICE_PERIOD_S = 0.5
+"""Time between two checks whether a robot measures, in s."""
+FIRST_NOTICE_NS = 2 * NS_PER_S
+"""Time without a measurement of a robot after which the user is told, in ns."""
+NEXT_NOTICE_NS = 60 * NS_PER_S
+"""Time without a measurement after which the user is told again, in ns."""
 REQUEST_PERIOD_S = 0.05
 """Time between two checks for new weights, in s."""
 TRIGGER = "std_srvs/srv/Trigger"
@@ -292,6 +298,62 @@ class DominanceTopic:
             self._change(requested)
 
 
+class SilenceNotice:
+    """Composes notices for the user while a robot sends no measurement.
+
+    The first notice is due after `FIRST_NOTICE_NS` without a measurement, and further ones
+    each time after `NEXT_NOTICE_NS`. A measurement starts this sequence again.
+
+    Args:
+        joints: Names that each joint of the arm may have in ROS messages.
+        clock: Clock of this process.
+    """
+
+    def __init__(self, joints: JointNames, clock: Clock) -> None:
+        self._joints = joints
+        self._clock = clock
+        self._due_ns = clock.monotonic_ns() + FIRST_NOTICE_NS
+        self._has_message = False
+        self._has_measurement = False
+        self._other_joints: Sequence[str] = ()
+
+    def note_message(self, other_joints: Sequence[str] = ()) -> None:
+        """Notes that a message has arrived, which need not be a measurement.
+
+        Args:
+            other_joints: Names of the joints in the message if none of them belongs to the arm.
+        """
+        self._has_message = True
+        if other_joints:
+            self._other_joints = other_joints
+
+    def note_measurement(self) -> None:
+        """Notes that a message was sent to the site as a measurement."""
+        self._has_measurement = True
+        self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
+
+    def pop(self, topic: str, site: str) -> str:
+        """Returns the notice if one is due now. Returns the empty text otherwise.
+
+        Args:
+            topic: Name of the topic, with its leading slash.
+            site: Name of the site that waits for the robot.
+        """
+        now_ns = self._clock.monotonic_ns()
+        if now_ns < self._due_ns:
+            return ""
+        self._due_ns = now_ns + NEXT_NOTICE_NS
+        if self._has_measurement:
+            return f"no further measurement on {topic}: {site} has lost its arm"
+        if not self._has_message:
+            return f"no message on {topic} yet: {site} waits for its arm"
+        text = f"no measurement on {topic} yet: {site} waits for its arm"
+        if self._other_joints:
+            wanted = ", ".join(names[0] for names in self._joints)
+            text += f" with {wanted}; a message has {', '.join(self._other_joints[:9])}"
+        return text
+
+
 class RobotArm:
     """A ROS robot that is the external arm of a site.
 
@@ -309,6 +371,7 @@ class RobotArm:
     Attributes:
         armed: False while the robot must receive only safe commands. The bridge sets it to True
             once the scenario is known.
+        silence: Notices for the user while the robot sends no measurement.
 
     Raises:
         UsageError: The settings do not have one entry for each joint.
@@ -335,6 +398,7 @@ class RobotArm:
 
         self._commands = commands
         self._clock = clock
+        self.silence = SilenceNotice(joints, clock)
         self._sender = _SingleSender(clock)
         self._lock = threading.Lock()
         # Process start (boot) and tick of the record whose torque was published last.
@@ -353,10 +417,12 @@ class RobotArm:
         Raises:
             ValueError: The message cannot be read, or two programs publish.
         """
+        self.silence.note_message()
         state = cdr.read_joint_state(data)
         known_names = {name for names in self._joints for name in names}
         is_other_robot = bool(state.names) and known_names.isdisjoint(state.names)
         if is_other_robot:
+            self.silence.note_message(state.names)
             return
 
         indices = _find_joint_indices(self._joints, state)
@@ -369,6 +435,7 @@ class RobotArm:
         with self._lock:
             self._sender.admit(attachment.gid)
             self._client.send(q, qd, stamp_ns=state.stamp_ns)
+        self.silence.note_measurement()
 
     def send_command(self) -> None:
         """Sends the robot the newest torque of the site, or the safe command if it must brake.
@@ -972,7 +1039,7 @@ def publish_session(
             # A robot whose joints are named needs no scenario, and can start before any site
             # replies.
             if robot.joints:
-                robot_context = _open_robot(ends, site, robot)
+                robot_context = _open_robot(ends, site, robot, say)
                 robots[site] = stack.enter_context(robot_context)
 
         say(f"waiting for session {ends.session!r} to begin")
@@ -985,7 +1052,7 @@ def publish_session(
             if site not in robots:
                 robot = ends.table.robots.get(site, RobotTable())
                 names = _list_joint_names(scenario, site)
-                robot_context = _open_robot(ends, site, robot, names)
+                robot_context = _open_robot(ends, site, robot, say, names)
                 robots[site] = stack.enter_context(robot_context)
             robots[site].armed = True
         if robots:
@@ -1053,6 +1120,7 @@ def _open_robot(
     ends: BridgeEnds,
     site: str,
     robot: RobotTable,
+    say: Callable[[str], None],
     joints: JointNames = (),
 ) -> Iterator[RobotArm]:
     """Connects the ROS robot of a site, as a context manager.
@@ -1064,6 +1132,7 @@ def _open_robot(
         ends: Connections to ROS and to the session.
         site: Name of the site whose arm is the robot.
         robot: Settings of the robot.
+        say: Function that prints a line for the user.
         joints: Names that each joint may have, in the order of the scenario. Empty uses the
             names in the settings.
 
@@ -1081,12 +1150,22 @@ def _open_robot(
         clock=ends.clock,
     )
     ends.graph.subscribe(states_topic, cdr.JOINT_STATE, arm.receive)
-    with _repeat_in_thread(DRIVE_PERIOD_S, arm.send_command, arm.send_safe_command):
+
+    def report_silence() -> None:
+        """Tells the user that the robot does not measure, if a notice is due."""
+        notice = arm.silence.pop(f"/{states_topic}", site)
+        if notice:
+            say(notice)
+
+    with (
+        _repeat_in_thread(NOTICE_PERIOD_S, report_silence),
+        _repeat_in_thread(DRIVE_PERIOD_S, arm.send_command, arm.send_safe_command),
+    ):
         yield arm
 
 
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
-    """Checks that each robot in the settings belongs to a site with an external arm.
+    """Checks that each robot belongs to a site with an external arm of as many joints.
 
     An external arm is a real arm, or a simulation in another program. Only for its site the
     settings of a robot have a meaning. Settings that equal the defaults are tolerated for the
@@ -1097,8 +1176,8 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
         scenario: Scenario of the session.
 
     Raises:
-        UsageError: A site without an external arm has settings of a robot, or the scenario has
-            no such site.
+        UsageError: A site without an external arm has settings of a robot, the scenario has no
+            such site, or the robot has another number of joints than the arm of its site.
     """
     for site, robot in table.robots.items():
         has_external_arm = site in scenario.outside
@@ -1110,6 +1189,15 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
                 f"--names: sites.{site}: no site of this name has an external arm; sites with "
                 f"an external arm: {outside}"
             )
+        if has_external_arm and robot.joints:
+            joints = scenario.arms[site].joint_names
+            if len(robot.joints) != len(joints):
+                names = count_nouns(len(robot.joints), "name")
+                count = count_nouns(len(joints), "joint")
+                raise UsageError(
+                    f"--names: sites.{site}.joints has {names}, but the arm of {site} has "
+                    f"{count}: {', '.join(joints)}"
+                )
 
 
 def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:

@@ -21,6 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 from trilat_ros2.ros2_bridge import (
+    FIRST_NOTICE_NS,
+    NEXT_NOTICE_NS,
     SAFE_PERIOD_NS,
     SENDER_TIMEOUT_NS,
     SILENCE_NS,
@@ -274,6 +276,19 @@ def test_a_site_without_external_arm_takes_no_robot(tmp_path: Path, site: str) -
         match=rf"sites\.{site}: no site of this name has an external arm; sites with an external arm: s",
     ):
         refuse_other_robots(TopicTable.read(str(tmp_path / "names.toml")), scenario)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_robots_have_as_many_joints_as_arms(count: int) -> None:
+    """A table of names with too few or too many joints is refused before anything moves."""
+    scenario = load_scenario(str(Path(__file__).parents[4] / "examples" / "external_arm.toml"))
+    robot = RobotTable(joints=["shoulder", "elbow", "wrist"][:count])
+    table = read_topic_table("crisp")._replace(robots={"s": robot})
+    if count == 2:
+        refuse_other_robots(table, scenario)
+        return
+    with pytest.raises(UsageError, match=rf"sites\.s\.joints has {count} name.* has 2 joints"):
+        refuse_other_robots(table, scenario)
 
 
 def test_reasons_of_strangers_are_counted_but_not_kept() -> None:
@@ -530,6 +545,29 @@ def test_joint_states_are_measurements_of_the_site() -> None:
     assert (first.q, first.qd, first.sent_ns) == ([1.0, 2.0], [3.0, 4.0], of_another_clock)
     assert (second.q, second.n, second.sent_ns) == ([1.5, 2.5], 1, 0)
     assert not robot.said
+
+
+def test_silent_robots_are_named_once_then_rarely() -> None:
+    """A notice names the topic and what is missing, and a measurement ends the notices."""
+    robot = Robot()
+
+    def hear(after_ns: int) -> str:
+        robot.clock.sleep_until(robot.clock.monotonic_ns() + after_ns)
+        return robot.arm.silence.pop("/joint_states", "s")
+
+    assert not hear(FIRST_NOTICE_NS - 1)
+    assert hear(1) == "no message on /joint_states yet: s waits for its arm"
+    robot.says(["wheel"], [7.0], [7.0])
+    assert not hear(NEXT_NOTICE_NS - 1)
+    assert hear(1) == (
+        "no measurement on /joint_states yet: s waits for its arm with shoulder, elbow; a "
+        "message has wheel"
+    )
+    for _ in range(3):
+        robot.says(["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
+        assert not hear(FIRST_NOTICE_NS - 1)
+    assert hear(1) == "no further measurement on /joint_states: s has lost its arm"
+    assert not hear(NEXT_NOTICE_NS - 1)
 
 
 @pytest.mark.parametrize(
