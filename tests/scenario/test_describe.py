@@ -236,3 +236,11 @@ def test_conditions_need_one_ratio_of_error_damping(
     conditions = [line for line in lines if line.startswith("condition")]
     assert conditions
     assert all(("one ratio" not in line) == is_known for line in conditions)
+
+
+@pytest.mark.parametrize("law", ["p_d", "pd_d", "lee_spong"])
+@pytest.mark.parametrize("gravity", [0.8, 1.0])
+def test_conditions_need_exact_gravity(law: str, gravity: float) -> None:
+    changes = {"control.law": law, "control.gravity": gravity}
+    lines = describe_scenario(load_scenario("p_d_margin_two", changes))
+    assert any(line.startswith("condition of") for line in lines) == (gravity == 1.0)
