@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 import trilat_net
+from tests.own_laws import PD
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.presentation.citation import compose_citation
 
 ROOT = Path(trilat_net.__file__).parents[1]
@@ -91,3 +93,38 @@ def test_the_papers_entry_is_the_citation_files() -> None:
     assert fields["title"].lower() == PAPER_TITLE.lower()
     assert re.findall(r"(\w+), [A-Z]", fields["author"]) == PAPER_AUTHORS
     assert fields["year"] == PAPER_YEAR
+
+
+@pytest.mark.parametrize(
+    ("settings", "phrases"),
+    [
+        (
+            {"control.K": 12.5},
+            ["p_d (K 12.5, d 2.1, gravity 1)", "Delays of the links: 200 ms."],
+        ),
+        ({"sites.m.control.d": 9.5, "seed": 4}, ["m: p_d (K 10, d 9.5", "seed 4"]),
+        ({"links.m->s.delay_ms": 35}, ["m->s: 35 ms", "s->m: 200 ms"]),
+        (
+            {"control.law": PD, "control.K": 7.0},
+            ["tests.own_laws:PD (K 7), other settings as "],
+        ),
+    ],
+)
+def test_citation_states_laws_gains_delays_and_seed(
+    settings: dict[str, object], phrases: list[str]
+) -> None:
+    log = trilat_net.simulate("p_d_margin_two", settings, duration_s=1.0)
+    paragraph = next(compose_citation(log, trilat_net.certify(log)))
+    for phrase in [*phrases, f"seed {log.scenario.seed}"]:
+        assert phrase in paragraph
+    for law in log.scenario.controls:
+        sha256 = getattr(law, "source_sha256", "")
+        assert sha256[:16] in paragraph
+
+
+def test_software_entry_states_version_and_commit() -> None:
+    log = trilat_net.simulate("p_d_margin_two", duration_s=1.0)
+    _, _, entry, *_ = compose_citation(log, trilat_net.certify(log))
+    facts = collect_provenance()
+    assert f"{{{facts['version_trilat-net']}}}" in entry
+    assert (facts["commit"] in entry) == (facts["commit"] != "unknown")

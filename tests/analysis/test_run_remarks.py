@@ -3,6 +3,7 @@
 import pytest
 
 from tests.analysis import logs
+from trilat_net import simulate
 from trilat_net.analysis.run_remarks import LARGE_PUSH_SHARE, list_remarks
 from trilat_net.net.messages import State
 
@@ -55,3 +56,21 @@ def test_calm_and_empty_logs_have_no_remarks() -> None:
     log = logs.simulated("paper")
     assert list_remarks(log) == ()
     assert list_remarks(logs.rewritten(log, lambda _: False)) == ()
+
+
+@pytest.mark.parametrize("half_width_ms", [0.0, 2.0, 50.0, 200.0])
+@pytest.mark.parametrize("order", ["newest", "in_order"])
+def test_ages_unlike_the_stated_delay_are_named(half_width_ms: float, order: str) -> None:
+    """The newest sample counts, so that jitter makes the samples in use younger."""
+    link = {"model": "uniform", "delay_ms": 200, "half_width_ms": half_width_ms, "order": order}
+    log = simulate("two_sites", {"links.m->s": link}, duration_s=4.0)
+    part = log["s"]
+    has_sample = part.used["m"] >= 0
+    mean_ms = float((part.tick - part.used["m"])[has_sample].mean()) * 1e3 / part.rate_hz
+    remarks = [text for text in list_remarks(log) if "samples in use" in text]
+    differs = abs(mean_ms - 200.0) > 10.0
+    assert differs == (half_width_ms >= 50.0)
+    assert bool(remarks) == differs
+    if remarks:
+        assert f"on m->s were {mean_ms:.4g} ms old on average" in remarks[0]
+        assert ("the newest sample counts" in remarks[0]) == (mean_ms < 200.0)

@@ -180,3 +180,56 @@ def test_missing_twins_are_explained() -> None:
     decision = decide(twins=no_twins)
     assert decision.stability is Stability.OPEN
     assert "its law may not run" in decision.reasons[0]
+
+
+@pytest.mark.parametrize("behaviour", [EndBehaviour.BOUNDED, EndBehaviour.DRIFTS])
+@pytest.mark.parametrize("pushes", [None, pushed(EnvelopeTrend.STEADY, 0.0)])
+def test_a_slow_numerical_decay_stays_open(
+    behaviour: EndBehaviour, pushes: TwinGrowth | None
+) -> None:
+    """The word depends on whether the roots would halve the motion in the judged part."""
+    judged_s = 20.0
+    steady = EnvelopeFit(EnvelopeTrend.STEADY, 0.0, False)
+    lasting = end(behaviour, error=steady, speed=steady, lasts_s=2.0 * judged_s)
+    for share in (0.01, 0.5, 0.99, 1.01, 3.0, 100.0):
+        rate_per_s = -share * math.log(2.0) / judged_s
+        roots = LoopRoots(
+            "stable", rate_per_s, False, "", is_numerical=True, swing_rate_per_s=rate_per_s
+        )
+        slow = decide(end=lasting, twins=pushes, roots=roots)
+        assert slow.stability is (Stability.OPEN if share <= 1.0 else Stability.NOT_STABLE)
+        assert ("too slow to be told from" in "".join(slow.reasons)) == (share <= 1.0)
+        agreeing = EnvelopeFit(EnvelopeTrend.HARDLY, 1.2 * rate_per_s, True)
+        decaying = lasting._replace(error=agreeing, speed=agreeing)
+        assert decide(end=decaying, twins=pushes, roots=roots).stability is Stability.OPEN
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"is_numerical": False},
+        {"verdict": "at the edge"},
+        {"swing_rate_per_s": None},
+        {"swing_rate_per_s": -3.0},
+    ],
+)
+def test_only_slow_numerical_swings_excuse_oscillations(changes: dict[str, object]) -> None:
+    """A slow root that does not oscillate explains no oscillation."""
+    roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
+    lasting = end(EndBehaviour.BOUNDED, lasts_s=40.0)
+    assert decide(end=lasting, roots=roots).stability is Stability.OPEN
+    changed = roots._replace(**changes)  # type: ignore[arg-type]
+    assert decide(end=lasting, roots=changed).stability is Stability.NOT_STABLE
+
+
+def test_growing_motion_is_not_excused_by_roots() -> None:
+    roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
+    growing = EnvelopeFit(EnvelopeTrend.GROWS, 0.01, False)
+    for run_end in (
+        end(EndBehaviour.GROWS, lasts_s=40.0),
+        end(EndBehaviour.BOUNDED, lasts_s=40.0, error=growing),
+        end(EndBehaviour.BOUNDED, lasts_s=40.0, speed=growing),
+    ):
+        assert decide(end=run_end, roots=roots).stability is Stability.NOT_STABLE
+    lasting = end(EndBehaviour.BOUNDED, lasts_s=40.0)
+    assert decide(end=lasting, roots=roots, twins=GROWING).stability is Stability.NOT_STABLE

@@ -120,6 +120,26 @@ def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
         assert page.evaluate(bridged, known[-1]) == 0
 
 
+@pytest.mark.parametrize("name", ["delay uniform", "planar task", "shipped paper"])
+def test_linear_axes_have_two_labelled_values(
+    name: str, browser: Browser, tmp_path: Path
+) -> None:
+    """The scale of a chart cannot be read from one value."""
+    with watched_page(browser, **SCREEN) as watched:
+        page = open_report(watched, VARIED[name](), tmp_path)
+        unfold(page)
+        labels = page.evaluate(
+            "trilat.plots().filter((plot) => plot.scales.y.distr === 1)"
+            ".map((plot) => plot.axes[1]._values)"
+        )
+        assert len(labels) > 4
+        for texts in labels:
+            shown = [text for text in texts if text]
+            assert len(shown) >= 2
+            values = [float(text) for text in shown]
+            assert sorted(set(values)) == values
+
+
 USED = ("live change", "six joints", "fault", "four sites")
 """Runs whose reports are played, zoomed and switched."""
 

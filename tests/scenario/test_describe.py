@@ -209,3 +209,38 @@ def test_lines_share_by_site_and_average_b() -> None:
         )
         total += lines.sum(axis=0)
     assert total / 6.0 == pytest.approx([6.0, 3.0])
+
+
+@pytest.mark.parametrize("gain", [1.5, 1.9999, 2.0, 6.0])
+@pytest.mark.parametrize("law", ["p_d", "pd_d"])
+def test_checks_evaluate_conditions_of_spring_laws(law: str, gain: float) -> None:
+    """Two sites with K = 10 N m/rad and 200 ms need d of at least 2 N m s/rad."""
+    scenario = load_scenario("p_d_margin_two", {"control.law": law, "control.d": gain})
+    (line,) = [line for line in describe_scenario(scenario) if line.startswith("condition")]
+    word = "holds" if gain >= 2.0 else "does not hold"
+    assert line.startswith(f"condition of {law} at m, s {word}: 4 d1 d2")
+
+
+@pytest.mark.parametrize("law", ["pd_d", "lee_spong"])
+@pytest.mark.parametrize(("factor", "is_known"), [(1.0, True), (2.0, False)])
+def test_conditions_need_one_ratio_of_error_damping(
+    law: str, factor: float, is_known: bool
+) -> None:
+    changes = {
+        "control.law": law,
+        "control.Kd": 3.0,
+        "sites.m.control.K": 10.0 * factor,
+        "sites.s.control.K": 10.0,
+    }
+    lines = describe_scenario(load_scenario("p_d_margin_two", changes))
+    conditions = [line for line in lines if line.startswith("condition")]
+    assert conditions
+    assert all(("one ratio" not in line) == is_known for line in conditions)
+
+
+@pytest.mark.parametrize("law", ["p_d", "pd_d", "lee_spong"])
+@pytest.mark.parametrize("gravity", [0.8, 1.0])
+def test_conditions_need_exact_gravity(law: str, gravity: float) -> None:
+    changes = {"control.law": law, "control.gravity": gravity}
+    lines = describe_scenario(load_scenario("p_d_margin_two", changes))
+    assert any(line.startswith("condition of") for line in lines) == (gravity == 1.0)

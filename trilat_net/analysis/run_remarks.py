@@ -6,6 +6,7 @@ a run was stable, but they show where the run was at the limits of its arms or o
 - a motor was at its torque limit, so that the control law did not act in full;
 - an operator or a wall pushed with a large share of the torque limit;
 - ticks (periods of the control loop) began late by a whole period or more;
+- samples in use were clearly younger or older than the delay that their link states;
 - a program of the user moved an arm, or failed while it did.
 
 Invariant:
@@ -18,10 +19,16 @@ import numpy as np
 from ..errors import count_nouns, join_words
 from ..log import Log
 from .dominance_history import list_program_sites
+from .link_summary import sample_ages_ns
 from .site_signals import external_torques
+from .timeline import list_effective_commands
 
 LARGE_PUSH_SHARE = 0.5
 """Least torque of operators and walls that is remarked, as a share of the torque limit."""
+
+
+LARGE_AGE_SHARE = 0.05
+"""Least remarked difference of the mean age in use from the stated delay, as its share."""
 
 
 def list_remarks(log: Log) -> tuple[str, ...]:
@@ -40,6 +47,7 @@ def list_remarks(log: Log) -> tuple[str, ...]:
         _describe_torque_limits(log),
         _describe_large_pushes(log),
         _describe_late_ticks(log),
+        _describe_ages(log),
         _describe_programs(log),
         *log.failed_hands,
     )
@@ -107,3 +115,40 @@ def _describe_late_ticks(log: Log) -> str:
     if not counts:
         return ""
     return f"{join_words(counts.values())} began late, by a period or more"
+
+
+def _describe_ages(log: Log) -> str:
+    """Returns how old the samples in use were, if a drawn delay states another age.
+
+    Under jitter the newest sample that arrived counts, so that the samples in use are younger
+    than the mean delay. Lost samples, and samples that wait for older ones, make them older.
+    Links that change during the run are left out.
+
+    Returns:
+        The clause, about the link with the largest difference. Empty if every link agrees.
+    """
+    changed = {change.link for change in log.scenario.timeline}
+    changed |= {change.link for change in list_effective_commands(log)}
+    differences = {}
+    for name, link in log.scenario.links.items():
+        stated_ms, deviation_ms = link.moments()
+        is_jittered = link.random and deviation_ms > 0.0 and stated_ms > 0.0
+        if name in changed or link.measured or not is_jittered:
+            continue
+        peer, site = name.split("->")
+        ages_ns = sample_ages_ns(log, peer, site)
+        if len(ages_ns):
+            age_ms = 1e-6 * float(ages_ns.mean())
+            differences[name] = (age_ms / stated_ms - 1.0, age_ms, stated_ms)
+    if not differences:
+        return ""
+    name, (share, age_ms, stated_ms) = max(
+        differences.items(), key=lambda item: abs(item[1][0])
+    )
+    if abs(share) <= LARGE_AGE_SHARE:
+        return ""
+    cause = "losses and waiting count" if share > 0.0 else "the newest sample counts"
+    return (
+        f"the samples in use on {name} were {age_ms:.4g} ms old on average, with a stated mean "
+        f"delay of {stated_ms:.4g} ms, because {cause}"
+    )

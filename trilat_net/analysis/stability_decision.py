@@ -21,7 +21,7 @@ Invariant:
     - Roots count as a proof only if they are exact: delays are constant, or repeat after a
       known period over which the loop was analysed.
     - Exact roots in the left half-plane exclude the word "not stable", except for a run that
-      left its limits.
+      left its limits. Numerical roots exclude it if the end of the run may be their slow decay.
     - A decision states what it rests on.
     - Twins never change a decision that `is_decided_by_roots` announces, so that a command may
       save them.
@@ -76,6 +76,8 @@ class LoopRoots(NamedTuple):
             program at m2 reacts to the arms". Empty if it contains everything.
         is_numerical: True if the code of a user's law was differentiated numerically. Such
             roots can refute a run, but not prove it stable.
+        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. None
+            if no computed root oscillates.
     """
 
     verdict: str
@@ -85,6 +87,7 @@ class LoopRoots(NamedTuple):
     distance_rad: float = 0.0
     leaves_out: str = ""
     is_numerical: bool = False
+    swing_rate_per_s: float | None = None
 
     @property
     def is_proof(self) -> bool:
@@ -114,6 +117,36 @@ class LoopRoots(NamedTuple):
         This needs exact roots: those of a loop with its ticks and its repeating delays.
         """
         return self.exact and self.verdict == "unstable"
+
+    def measure_decay_misfit(self, end: RunEnd) -> float:
+        """Measures how badly the slow decay of these roots explains an end that looks lasting.
+
+        An oscillation is compared with the roots that oscillate, because another slow root does
+        not explain the oscillation, and a drift with the slowest root. The decay is compatible
+        if the root halves the motion at most once in the judged part, so that no trend can show
+        the decay, or if |e| and |qd| have the rate of the root.
+
+        Args:
+            end: How the motion ends.
+
+        Returns:
+            A share without unit: at most 1 if the end may be the decay, infinity if the roots
+            are not numerical or not stable, or if the motion grows or is not lasting.
+        """
+        is_swing = end.behaviour is EndBehaviour.BOUNDED
+        is_lasting = is_swing or end.behaviour is EndBehaviour.DRIFTS
+        rate_per_s = self.swing_rate_per_s if is_swing else self.rate_per_s
+        is_stable = self.is_numerical and self.verdict == "stable"
+        if rate_per_s is None or not is_stable or not is_lasting:
+            return math.inf
+        misfits = []
+        for fit in (end.error, end.speed):
+            if fit.trend is EnvelopeTrend.GROWS:
+                return math.inf
+            misfits.append(_measure_rate_misfit(fit.rate_per_s, rate_per_s))
+        judged_s = 0.5 * (end.lasts_s - end.counts_from_s)
+        halvings = -rate_per_s * judged_s / math.log(DOUBLES)
+        return min(halvings, max(misfits))
 
 
 class StabilityDecision(NamedTuple):
@@ -202,7 +235,7 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
     if proofs and not reasons and _agrees_with_proof(run):
         return StabilityDecision(Stability.STABLE, "; ".join(proofs))
     looks_unstable = end.stability is Stability.NOT_STABLE
-    if looks_unstable and not run.has_stable_roots and not _pushes_excuse_end(run):
+    if looks_unstable and not run.has_stable_roots and not _is_end_excused(run):
         # The frequency of an oscillation is known only if all records are.
         end_text = end._replace(frequency_hz=None).text
         return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end_text}")
@@ -327,19 +360,29 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
     worst = None if run.twins is None else run.twins.worst
     if worst is None or roots is None or not roots.is_proof or roots.rate_per_s is None:
         return False
-    difference_per_s = abs(worst.rate_per_s - roots.rate_per_s)
-    tolerance_per_s = RATE_AGREEMENT_SHARE * abs(roots.rate_per_s) + RATE_AGREEMENT_PER_S
-    return worst.rate_per_s < 0.0 and difference_per_s <= tolerance_per_s
+    return (
+        worst.rate_per_s < 0.0
+        and _measure_rate_misfit(worst.rate_per_s, roots.rate_per_s) <= 1.0
+    )
 
 
-def _pushes_excuse_end(run: RunFindings) -> bool:
-    """Returns True if the pushes contradict a run whose end looks not stable.
+def _measure_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
+    """Returns the difference of a measured rate and a root as a share of the tolerance."""
+    tolerance_per_s = RATE_AGREEMENT_SHARE * abs(root_per_s) + RATE_AGREEMENT_PER_S
+    return abs(measured_per_s - root_per_s) / tolerance_per_s
 
-    They do if all of them die away, or if the run seems to grow although no push grows and the
-    energy function V did not rise. They also do if the judged part of the run is shorter than
-    the period of its delays, so that it may show a beat, or if no push grows clearly and the
-    judged part has few bursts of lost samples, so that it may show the last of them.
+
+def _is_end_excused(run: RunFindings) -> bool:
+    """Returns True if slow roots or the pushes contradict a run whose end looks not stable.
+
+    Stable numerical roots do if the end may be their decay. Pushes do if all of them die away,
+    or if the run seems to grow although no push grows and the energy function V did not rise.
+    They also do if the judged part of the run is shorter than the period of its delays, so that
+    it may show a beat, or if no push grows clearly and the judged part has few bursts of lost
+    samples, so that it may show the last of them.
     """
+    if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
+        return True
     if not run.has_pushes:
         return False
     assert run.twins is not None
@@ -390,6 +433,12 @@ def _explain_open(run: RunFindings) -> str:
     """Returns why a run is open although nothing contradicts a stable run."""
     if run.all_proofs:
         return "the end of the run does not agree with its proof"
+    if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
+        lasting = "drift" if run.end.behaviour is EndBehaviour.DRIFTS else "oscillation"
+        return (
+            f"too slow to be told from a lasting {lasting} in the judged part; its numerical "
+            f"roots decay at {run.roots.rate_per_s:.3g} /s"
+        )
     if run.twins is None:
         return "no proof exists, and no run with small pushes was made"
     if not run.twins.pushes:

@@ -164,7 +164,7 @@ def judge_position_exchange(
 
     Returns:
         The condition. It is undecided for delays that vary, for several tick rates, in task
-        space, and if the sites have different laws.
+        space, and if the sites have different laws or ratios Kd / K.
     """
     laws = situation.laws
     if situation.in_task_space:
@@ -184,6 +184,11 @@ def judge_position_exchange(
     if np.isnan(situation.longest_s) or np.isnan(K).any():
         text = "known for constant delays, and with this law at all sites"
         return StabilityCondition(None, text)
+    error_dampings = [np.broadcast_to(getattr(law, "Kd", 0.0), K.shape[1:]) for law in laws]
+    ratios_s = np.array(error_dampings) / K
+    if not np.allclose(ratios_s, ratios_s[0], rtol=1e-9, atol=0.0):
+        # docs/theory/damping-conditions.md: with other ratios some arms are unstable
+        return StabilityCondition(None, "known for one ratio Kd / K at all sites")
     if np.isnan(hold_s):
         text = "known of held torques for sites of one tick rate"
         return StabilityCondition(None, text)

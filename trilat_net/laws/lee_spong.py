@@ -104,7 +104,13 @@ class LeeSpong(ControlLaw):
 
         Args:
             situation: The site, its peers (the other sites) and the delays between them.
+
+        Returns:
+            The condition. None if the law does not compensate gravity exactly, because then no
+            condition is known.
         """
+        if self.gravity != 1.0:
+            return None
         return judge_position_exchange(situation, "K", "damping")
 
     @classmethod

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints, PositiveCoordinates
+from .conditions import LawSituation, StabilityCondition, judge_position_exchange
 from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 
 
@@ -78,6 +79,20 @@ class PdD(ControlLaw):
             d=self.d,
             known=known,
         )
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+
+        Args:
+            situation: The site, its peers (the other sites) and the delays between them.
+
+        Returns:
+            The condition of P+d on K and d. None if the law does not compensate gravity
+            exactly, because then no condition is known.
+        """
+        if not self.exchanges_positions():
+            return None
+        return judge_position_exchange(situation, "K", "d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law compensates gravity exactly.

@@ -233,7 +233,7 @@ def _explain_judgement(certificate: Certificate) -> str:
         )
     pace = describe_pace(certificate)
     if stability is Stability.NOT_STABLE:
-        return pace or "the motion of this loop does not come to rest"
+        return pace or "the motion of this run does not come to rest"
     pace = pace or "small disturbances die away"
     if not certificate.has_functional:
         return f"{pace}; the theorem of the paper is about another control law"

@@ -9,18 +9,22 @@ Invariant:
     - A source is listed only if the statement rests on it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+
+import msgspec
 
 from ..analysis import Certificate, Stability
 from ..errors import count_nouns
 from ..files import find_version
-from ..log import Log
+from ..log import Log, collect_provenance
+from ..own_code import ImportedLaw
+from ..scenario import Scenario, describe_value
 
 _SOFTWARE = """@software{{trilat_net,
   title   = {{trilat-net}},
   author  = {{{{The trilat-net authors}}}},
   version = {{{version}}},
-  license = {{MIT}}
+  license = {{MIT}}{note}
 }}"""
 _PUSHES = """@article{Benettin1980,
   title   = {Lyapunov characteristic exponents for smooth dynamical systems and for
@@ -74,7 +78,7 @@ def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
     """
     yield " ".join(_compose_sentences(log, certificate))
     yield ""
-    yield _SOFTWARE.format(version=find_version())
+    yield _SOFTWARE.format(version=find_version(), note=_format_commit())
     for entry in _list_sources(certificate):
         yield ""
         yield entry
@@ -84,13 +88,13 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
     """Yields the sentences of the paragraph."""
     scenario = log.scenario
     ticks = sum(len(log[site]) for site in log.sites)
-    laws = ", ".join(dict.fromkeys(law.tag for law in scenario.controls))
     yield (
         f"The run of the scenario {scenario.name} (SHA-256 {scenario.sha256[:16]}, "
-        f"{count_nouns(len(scenario.names), 'site')}, control law {laws}) was recorded with "
+        f"{count_nouns(len(scenario.names), 'site')}, seed {scenario.seed}) was recorded with "
         f"{count_nouns(ticks, 'record')} and judged with trilat-net {find_version()} "
         "\\cite{trilat_net}."
     )
+    yield from _state_settings(scenario)
     decision = certificate.decision
     statement = f"The run {_STATEMENTS[decision.stability]}"
     if decision.rests_on:
@@ -121,6 +125,50 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
         )
     evidence = certificate.evidence.text
     yield f"Log: {evidence}."
+
+
+def _state_settings(scenario: Scenario) -> Iterator[str]:
+    """Yields the sentences on the control laws with their gains, and on the delays.
+
+    Sites with the same law and gains share an entry, and so do links with the same delay.
+    """
+    laws = {}
+    for name, site in scenario.sites.items():
+        control = site.control
+        law = control.tag
+        gains = msgspec.structs.asdict(control)
+        source = ""
+        if isinstance(control, ImportedLaw):
+            law = control.code
+            gains = control.settings
+            source = f", other settings as in its file (SHA-256 {control.source_sha256[:16]})"
+        values = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
+        laws[name] = f"{law} ({values}){source}" if values else f"{law}{source}"
+    links = {name: link.describe() for name, link in scenario.links.items()}
+    for title, texts in (("Control laws", laws), ("Delays of the links", links)):
+        if texts:
+            yield f"{title}: {_group_equal(texts)}."
+    if scenario.timeline:
+        yield f"The scenario plans {count_nouns(len(scenario.timeline), 'change')} of settings."
+
+
+def _group_equal(texts: Mapping[str, str]) -> str:
+    """Returns texts with the names that each is about, once if all are equal."""
+    names: dict[str, list[str]] = {}
+    for name, text in texts.items():
+        names.setdefault(text, []).append(name)
+    if len(names) == 1:
+        return next(iter(names))
+    return "; ".join(f"{', '.join(owners)}: {text}" for text, owners in names.items())
+
+
+def _format_commit() -> str:
+    """Returns the field of a BibTeX entry with the commit of this program. Empty if unknown."""
+    facts = collect_provenance()
+    if facts["commit"] == "unknown":
+        return ""
+    changes = ", with changes" if facts["commit_dirty"] == "true" else ""
+    return f",\n  note    = {{Commit {facts['commit']}{changes}}}"
 
 
 def _list_sources(certificate: Certificate) -> list[str]:

@@ -7,13 +7,15 @@ Invariant:
     - Everything in this section is folded, except the commands.
 """
 
+import shlex
 from datetime import UTC, datetime
 from pathlib import Path
 
 from markupsafe import Markup
 
-from ..errors import count_nouns
+from ..errors import count_nouns, join_words
 from ..log import Log, describe_unknown_ends
+from ..own_code import find_user_laws
 from ..results import JsonObject
 from ..scenario import Scenario, compare_scenarios, list_arm_notes, list_shipped, load_scenario
 from .html_templates import render_macro
@@ -55,6 +57,12 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     ]
     body = render_code(_list_commands(log, name)) + render_folds(folds)
     intro = "These commands check the log, simulate its run again, and run its scenario."
+    law_files = _list_law_files(scenario)
+    if law_files:
+        intro += (
+            f" They execute {join_words(law_files)}, which another person may have written. "
+            "Run them in the folder from which the code is imported, with the log beside it."
+        )
     return render_section("Do this again", intro, body, "origin")
 
 
@@ -170,11 +178,25 @@ def _list_commands(log: Log, scenario: str) -> str:
     file_name = Path(log.source).name
     if not file_name.endswith(".mcap"):
         file_name = "FILE"  # the log was not read from a file
-    commands = [f"trilat verify {file_name}", f"trilat verify --virtual {file_name}"]
+    permissions = [f" --law {shlex.quote(file)}" for file in _list_law_files(log.scenario)]
+    log_argument = file_name + "".join(permissions)
+    commands = [f"trilat verify {log_argument}", f"trilat verify --virtual {log_argument}"]
     if scenario.endswith(".toml"):
         commands.append(f"trilat scenario show {file_name} > {scenario}")
     commands.append(f"trilat sim {scenario}")
     return "\n".join(commands)
+
+
+def _list_law_files(scenario: Scenario) -> list[str]:
+    """Returns the files of the user-written control laws, relative to the folder of imports.
+
+    A log names the module of a law, such as "mine.laws", and not the folder of its file.
+    """
+    files = []
+    for law in find_user_laws(scenario):
+        module, _, _ = law.code.partition(":")
+        files.append(f"{module.replace('.', '/')}.py")
+    return list(dict.fromkeys(files))
 
 
 def _list_versions(log: Log) -> list[tuple[str, str]]:

@@ -46,7 +46,7 @@ _SEVERE_ALARMS = ("FAULT", "STOPPED")
 
 _MEANINGS = {
     Stability.STABLE: "A proof holds for this loop, and the run agrees with it",
-    Stability.NOT_STABLE: "The motion of this loop does not come to rest",
+    Stability.NOT_STABLE: "The motion of this run does not come to rest",
     Stability.OPEN: "Nothing decides whether this loop is stable",
 }
 """What each judgement means. The meaning of a settled run has numbers, see `_explain_word`."""

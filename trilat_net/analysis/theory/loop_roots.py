@@ -420,7 +420,14 @@ def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots
     if spectrum.drifting:
         drift = f"{spectrum.drifting} of its motions keep their speed, the others "
     text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{basis}"
-    return LoopRoots(verdict, root.s.real, exact, text)
+    swing_rates_per_s = [other.s.real for other in spectrum.roots if other.s.imag]
+    return LoopRoots(
+        verdict=verdict,
+        rate_per_s=root.s.real,
+        exact=exact,
+        text=text,
+        swing_rate_per_s=max(swing_rates_per_s, default=None),
+    )
 
 
 def _explain_no_roots(reason: str) -> LoopRoots:

@@ -61,7 +61,16 @@
     zooming = false;
   }
 
-  const written = (u, splits, index, space, step) => { // as many digits as tell one from the next
+  // Values of a linear axis: two at least, so that the scale of a low chart can be read.
+  const levels = (u, index, min, max, increment) => {
+    let step = increment;
+    const first = () => Math.ceil(min / step - 1e-9);
+    const count = () => Math.floor(max / step + 1e-9) - first() + 1;
+    for (let halvings = 0; halvings < 4 && count() < 2; halvings += 1) step *= 0.5;
+    return Array.from({ length: count() }, (_, n) => (first() + n) * step);
+  };
+  const written = (u, splits, index, space, increment) => { // as many digits as tell one from the next
+    const step = splits[0] != null && splits[1] != null ? splits[1] - splits[0] : increment;
     let digits = 0;
     while (digits < 12 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits += 1;
     return splits.map((v) => (v == null ? "" : v.toFixed(digits)));
@@ -174,7 +183,7 @@
           value: (u, v) => number(v, chart.unit),
         })),
       ],
-      axes: [axis("time (s)", { size: 30 }), axis(box.closest("#overview") ? chart.unit : null, { size: box.closest("#overview") ? 52 : 46, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: rungLabels } : {}) })],
+      axes: [axis("time (s)", { size: 30 }), axis(box.closest("#overview") ? chart.unit : null, { size: box.closest("#overview") ? 52 : 46, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: rungLabels } : { splits: levels }) })],
       hooks: {
         drawAxes: [marks(chart), ...(chart.links ? [] : [horizontals(lines)])],
         draw: chart.links ? [horizontals(lines)] : [],

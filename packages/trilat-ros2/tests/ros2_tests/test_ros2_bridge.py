@@ -283,7 +283,7 @@ def test_robots_have_as_many_joints_as_arms(count: int) -> None:
     """A table of names with too few or too many joints is refused before anything moves."""
     scenario = load_scenario(str(Path(__file__).parents[4] / "examples" / "external_arm.toml"))
     robot = RobotTable(joints=["shoulder", "elbow", "wrist"][:count])
-    table = read_topic_table("crisp")._replace(robots={"s": robot})
+    table = TopicTable.read("crisp")._replace(robots={"s": robot})
     if count == 2:
         refuse_other_robots(table, scenario)
         return

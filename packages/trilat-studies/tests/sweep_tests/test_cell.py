@@ -15,6 +15,7 @@ from trilat_studies.sweep.sweep_results import build_sim_command
 from trilat_studies.sweep.sweep_run import CellItem, run_cell
 
 from sweep_tests.quick import Judge, plan_quick_sweep
+from tests.own_laws import CompiledPD
 from trilat_net.app.cli.options import load_chosen_scenario
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -72,6 +73,16 @@ def test_a_cell_without_valid_scenario_is_refused(tmp_path: Path) -> None:
     assert outcome.verdict is CellClass.REFUSED
     assert outcome.verdict.stable is None
     assert re.match(r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd", outcome.reasons)
+
+
+@pytest.mark.parametrize("damping", [1.9245, 1.926, 1.93])
+def test_stable_own_laws_are_extended_not_refused(damping: float) -> None:
+    """The exact edge of this loop is at d = 1.92; above, motion decays too slowly to show."""
+    changes = {"control.law": CompiledPD, "control.d": damping, "duration_s": 20.0}
+    scenario = load_scenario("p_d_margin_two", changes)
+    cell = sweep_cell.classify_cell(scenario.text, longest_s=40.0)
+    assert cell.verdict.stable is None
+    assert (cell.extended, cell.ran_s) == (1, 40.0)
 
 
 texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)

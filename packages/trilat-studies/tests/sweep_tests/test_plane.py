@@ -163,6 +163,20 @@ def test_majorities_of_runs_decide_and_draws_do_not() -> None:
     )
 
 
+@pytest.mark.parametrize("half_width_ms", [0.0, 50.0])
+def test_labels_call_drawn_delays_stated(half_width_ms: float) -> None:
+    """The newest sample counts, so that the age in use is smaller than a drawn delay."""
+    scenario = load_scenario("free")
+    link = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": half_width_ms}
+    if half_width_ms:
+        scenario = load_scenario("free", {"links.m1->s": link})
+    prefix = "stated " if half_width_ms else ""
+    assert label_axis("link.delay_ms", scenario) == f"{prefix}delay (ms)"
+    assert label_axis("links.m1->s.delay_ms", scenario) == f"{prefix}delay m1->s (ms)"
+    assert label_axis("links.s->m1.delay_ms", scenario) == "delay s->m1 (ms)"
+    assert label_axis("control.Kd", scenario) == label_axis("control.Kd")
+
+
 @pytest.mark.parametrize(
     ("key", "text"),
     [

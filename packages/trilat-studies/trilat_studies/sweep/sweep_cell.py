@@ -25,6 +25,7 @@ from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     EndBehaviour,
     GrowthColumn,
+    RunEnd,
     RunTrace,
     Stability,
     TwinGrowth,
@@ -32,6 +33,7 @@ from trilat_net.analysis import (
     judge_virtual_run,
 )
 from trilat_net.execution import FusedRun, check_fusable
+from trilat_net.own_code import ImportedLaw
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -225,7 +227,7 @@ class _CellInProgress:
         at a wall is not extended, see `classify_cell`.
         """
         self._totals = self.run.totals._asdict()
-        self._outcome = self._build_result()
+        self._evaluate()
         if self._end_s < self._longest_s and _chatters(self._scenario, self.run):
             self._longest_s = self._end_s
 
@@ -235,7 +237,7 @@ class _CellInProgress:
         A run is finished if a longer one would end in the same way, or at the longest duration.
         Otherwise its duration is doubled.
         """
-        if is_conclusive(self._outcome) or self._end_s >= self._longest_s:
+        if self._is_finished or self._end_s >= self._longest_s:
             return None
         return min(2.0 * self._end_s, self._longest_s)
 
@@ -247,7 +249,7 @@ class _CellInProgress:
         """
         self._end_s = end_s
         self._extended += 1
-        self._outcome = self._build_result()
+        self._evaluate()
 
     def judge(self) -> CellResult:
         """Returns the result of the cell, with the decision of the stability certificate.
@@ -265,9 +267,20 @@ class _CellInProgress:
             rests_on=decision.rests_on,
         )
 
-    def _build_result(self) -> CellResult:
-        """Returns the measured result of the run so far, from which extensions are decided."""
-        return _build_result(self.run, self._scenario, self._totals, self._extended)
+    def _evaluate(self) -> None:
+        """Measures the run so far, and decides whether a longer run would end in the same way.
+
+        A lasting motion under a user's law may be a decay that is too slow to show. The roots
+        of the loop, which take longer than the measurement, are computed in this case only.
+        """
+        trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
+        end = trace.classify_end(self._scenario)
+        self._outcome = _build_result(self.run, end, self._totals, self._extended)
+        self._is_finished = is_conclusive(self._outcome)
+        has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
+        if self._is_finished and has_own_law and end.stability is Stability.NOT_STABLE:
+            roots = find_run_roots(self._scenario, self.run)
+            self._is_finished = roots.measure_decay_misfit(end) > 1.0
 
 
 def classify_cell(text: str, longest_s: float) -> CellResult:
@@ -484,17 +497,16 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 
 
 def _build_result(
-    run: FusedRun, scenario: Scenario, totals: Mapping[str, Any], extended: int
+    run: FusedRun, end: RunEnd, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
     """Returns the result of a run up to the time that the run has reached.
 
     Args:
         run: The run.
-        scenario: Scenario of the run.
+        end: How the motion ends.
         totals: Totals over the scenario's duration, without extensions, see `RunTotals`.
         extended: Number of times that the duration was doubled.
     """
-    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
     return CellResult(
         verdict=classify_decision(end.stability, end.behaviour),
         motion=end.behaviour,

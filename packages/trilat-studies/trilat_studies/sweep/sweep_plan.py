@@ -876,11 +876,19 @@ _GAINS = {
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
     """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
 
+    A delay of links that draw their delays is called stated, because the newest sample counts,
+    so that the age of the samples in use is smaller.
+
     Args:
         key: Scenario key of the axis.
         scenario: Scenario in which the names of operators and walls are looked up.
     """
     quantity, unit = _describe_key(key, scenario)
+    if scenario is not None and key.startswith("link") and key.endswith("delay_ms"):
+        _, *names, _ = key.split(".")
+        links = [scenario.links[name] for name in names or scenario.links]
+        if any(link.random and link.moments().deviation_ms > 0.0 for link in links):
+            quantity = f"stated {quantity}"
     return f"{quantity} ({unit})" if unit else quantity
 
 
