@@ -113,17 +113,20 @@ class _RunKey(msgspec.Struct, frozen=True):
 _KEYS = msgspec.json.Decoder(_RunKey)
 
 
-def _read_key(text: bytes) -> _RunKey:
+def _read_key(text: bytes, kind: type[E]) -> _RunKey:
     """Returns which run the JSON text of a journal line belongs to.
 
     Args:
         text: The line without its checksum.
+        kind: Type of the entries.
     """
     try:
         return _KEYS.decode(text)
     except msgspec.DecodeError:
-        # The module json accepts infinity, and msgspec does not.
-        return msgspec.convert(json.loads(text), _RunKey)
+        # The module json accepts infinity, and msgspec does not. Entries may derive their cell
+        # from several fields.
+        entry = msgspec.convert(json.loads(text), kind)
+        return _RunKey(entry.cell, entry.seed)
 
 
 class StoredRuns(Mapping[tuple[Any, int], E]):
@@ -211,7 +214,7 @@ class RunJournal(Generic[E]):
                 for line in stream:
                     text, tab, digits = line.removesuffix(b"\n").rpartition(b"\t")
                     if tab and digits == b"%08x" % self._checksum(text):
-                        self.done.add_offset(_read_key(text), offset)
+                        self.done.add_offset(_read_key(text, kind), offset)
                     offset += len(line)
                     is_torn = not line.endswith(b"\n")
         self._file = extend_file(path)
