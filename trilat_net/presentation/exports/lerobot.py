@@ -12,8 +12,9 @@ Invariant:
     - A frame is left out if such a record is older than the period of the site's control loop
       and also older than the period of the frames. Then its episode ends, and the next one
       begins after the gap.
-    - Observations and actions are states of a site at the frame, as its own records have them. The
-      delays of links act on the samples of peers alone, whose ages the features `age_s` are.
+    - Observations and actions are states of a site at the frame, as its own records have them.
+      The delays of links act on the samples of peers alone. The features `age_s` are the ages
+      of these samples.
     - Numbers are float32. An orientation is six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
@@ -59,12 +60,12 @@ _MEANINGS = {
         "angles, rad, and velocities, rad/s, of the slave's joints; with "
         "observations=reference also the reference that it follows (.ref), in the units of the "
         "actions that sites share; with observations=plugin the observation of "
-        "lerobot_robot_trilat. All are states of a site at the frame, without the delays of links"
+        "lerobot_robot_trilat. All are states of a site at the frame, without delays of links"
     ),
     "observation.environment_state": "the same numbers, for policies that need this name",
     "action": (
-        "where the arm of the leading user is at the frame; action.USER is where the arm of each "
-        "user is: angles, rad, or a position, m, and an orientation"
+        "where the arm of the leading user is at the frame; action.USER is where the arm of "
+        "each user is: angles, rad, or a position, m, and an orientation"
     ),
     "r11.rot": (
         "an orientation is six entries of the rotation matrix, its first and second column"
@@ -76,8 +77,9 @@ _MEANINGS = {
     ),
     "age_s": (
         "age, s, of the sample of each user that the slave follows at the frame, as the delays "
-        "of the links make it; age_s.USER is the age of the sample of the slave that the site of "
-        "each user has in use. Before the first sample, the time since the start of the session"
+        "of the links make it; age_s.USER is the age of the sample of the slave that the site "
+        "of each user has in use. Before the first sample, the time since the start of the "
+        "session"
     ),
     "intervention": "true if a user other than the program leads; left out without a program",
     "next.done": "true in the last frame of an episode",
