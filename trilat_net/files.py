@@ -20,7 +20,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module, metadata
@@ -466,7 +466,12 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
 
 
 def write_whole(
-    path: Path, data: bytes | str, *, force: bool = True, remedy: str = "", mode: int = 0o666
+    path: Path,
+    data: bytes | str | Iterable[str],
+    *,
+    force: bool = True,
+    remedy: str = "",
+    mode: int = 0o666,
 ) -> None:
     """Writes a file in one step, so that readers never see a part of it.
 
@@ -476,7 +481,8 @@ def write_whole(
 
     Args:
         path: The file.
-        data: Its content. Text is encoded as UTF-8.
+        data: Its content. Text is encoded as UTF-8. An iterable yields the parts of a text that
+            may be too large for the memory.
         force: True if an existing file may be replaced.
         remedy: Advice that the error contains if the disk is full.
         mode: Permissions of a new file, before the umask.
@@ -485,20 +491,21 @@ def write_whole(
         UsageError: The file exists, is a symbolic link, or cannot be made.
         LogRefused: The disk refused the data.
     """
-    content = data.encode() if isinstance(data, str) else data
+    parts = [data] if isinstance(data, bytes | str) else data
     refuse_link(path)
     if not force:
         refuse_existing(path, force=False)
     try:
         if path.exists() and not path.is_file():
-            path.write_bytes(content)
+            with path.open("wb") as stream:
+                _write_parts(stream, parts)
             return
         unfinished = path.with_name(f"{path.name}.unfinished")
         try:
             # A file of an earlier attempt may have other permissions.
             unfinished.unlink(missing_ok=True)
             with open(unfinished, "xb", opener=partial(os.open, mode=mode)) as stream:
-                stream.write(content)
+                _write_parts(stream, parts)
                 stream.flush()
                 os.fsync(stream.fileno())
             publish_file(unfinished, path, force=force)
@@ -507,6 +514,12 @@ def write_whole(
             raise
     except OSError as error:
         raise describe_write_error(path, error, remedy) from None
+
+
+def _write_parts(stream: BinaryIO, parts: Iterable[bytes | str]) -> None:
+    """Writes the parts of a file one after the other. Text is encoded as UTF-8."""
+    for part in parts:
+        stream.write(part.encode() if isinstance(part, str) else part)
 
 
 @contextmanager

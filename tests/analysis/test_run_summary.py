@@ -127,7 +127,7 @@ def test_changes_are_reported_with_their_author():
     ]
     assert changes == [
         (1.0, "a->c", "90 ms, loss 10 %", "c", None),
-        (3.0, "c->a", "uniform 30 +- 17.3 ms", "a", 500),
+        (3.0, "c->a", "uniform 0 to 60 ms", "a", 500),
         (4.0, "shares of c", "a 0.9, b 0.1 within 1 s", "c", None),
     ]
     assert [s["from_s"] for s in facts["links"]["c->a"]["stated"]] == [0.0, 3.0]

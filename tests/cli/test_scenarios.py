@@ -86,7 +86,7 @@ def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
 
 def test_check_states_consequences_of_a_scenario(tmp_path: Path) -> None:
     text = trilat("scenario", "check", "asymmetric", cwd=tmp_path).succeeds()
-    assert "weights of the sites in the proof of stability, sum 3 " in text
+    assert "weights of the sites in the proof of stability, pi with the sum 3 " in text
     assert ": m1 1.279, m2 0.4655, s 1.256" in text
     assert "20000 ticks of m1" in text
     assert "m2->s: 310 ms" in text

@@ -142,7 +142,7 @@ def test_key_numbers_have_place_and_time() -> None:
     log = logs.simulated("paper")
     facts = summarise_run(log)
     html = render_key_numbers(log, facts)
-    names = {"s from where the masters lead": ["s"], "m1 and m2 from the others": ["m1", "m2"]}
+    names = {"s from its reference": ["s"], "m1 and m2 from the others": ["m1", "m2"]}
     for name, sites in names.items():
         peak = find_error_peak(log, sites)
         assert peak is not None

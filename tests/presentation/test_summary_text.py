@@ -36,14 +36,14 @@ def test_constant_links_without_loss_get_no_line():
 def test_links_give_stated_and_measured_values():
     link = {"link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50}
     line = format_link_lines(trilat_net.simulate("two_sites", {"duration_s": 2, **link}))[0]
-    assert line.startswith("link s->m: stated uniform 200 +- 28.9 ms; effective 16")
+    assert line.startswith("link s->m: stated uniform 150 to 250 ms; effective 16")
     assert " superseded " in line
     assert "lost" not in line
 
 
 def test_events_are_reported_once():
     lines = format_run_lines(logs.busy().log)
-    link = "the link c->a was set to uniform 30 +- 17.3 ms, from 3 s on"
+    link = "the link c->a was set to uniform 0 to 60 ms, from 3 s on"
     shares = "the shares of c were set to a 0.9, b 0.1 within 1 s, from 4 s on"
     assert f"change: {link} (applied at tick 500)" in lines
     assert f"change: {shares} (by the scenario)" in lines

@@ -544,7 +544,10 @@ class Membership:
             f"{local.member} has scenario {local.scenario_sha256[:16]}"
         )
         if not self.is_leader and info.member == self._sites[0]:
-            raise SessionError(f"{text}; the scenario of the leader {info.member} applies")
+            raise SessionError(
+                f"{text}; the leader {info.member} decides: start this site with the same "
+                "--scenario and the same --set"
+            )
         if self.is_leader and info.boot not in self._refused_boots:
             self._refused_boots.add(info.boot)
             self._publisher.publish("refused", text, about=info.member)

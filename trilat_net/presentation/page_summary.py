@@ -275,7 +275,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
     masters = [site for site in log.sites if site not in slaves]
     cards = []
     if slaves:
-        cards.append(_describe_errors(log, slaves, "from where the masters lead"))
+        cards.append(_describe_errors(log, slaves, "from its reference"))
         cards += _describe_undelayed_error(log, slaves)
     if masters:
         cards.append(_describe_errors(log, masters, "from the others"))
@@ -329,7 +329,11 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumbe
     if not known:
         return []
     name = f"{join_words(slaves)} from where the masters are"
-    return [_KeyNumber(name, f"{max(known):.3g} {unit}", "largest, with the delay included")]
+    return [
+        _KeyNumber(
+            name, f"{max(known):.3g} {unit}", "largest at the same moment, delay included"
+        )
+    ]
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:

@@ -444,6 +444,15 @@ def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
     return errors
 
 
+_USED_FIELD = "used["
+"""Start of the name of a record's field with the tick of a peer's sample in use."""
+
+
+def _name_sample(tick: object) -> str:
+    """Returns the name of a peer's sample in use by its tick, which is -1 before the first."""
+    return "none" if tick == -1 else f"that of tick {tick}"
+
+
 def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
     """Returns lines on the differences between the rerun of a site and the log.
 
@@ -460,6 +469,10 @@ def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
         logged, computed = _format_difference(first.logged, first.computed)
         when = f"tick {first.tick} ({first.tick / rate_hz:.3f} s)"
         change = f"{first.field} was {logged}, is {computed}"
+        if first.field.startswith(_USED_FIELD):
+            peer = first.field.removeprefix(_USED_FIELD).removesuffix("]")
+            samples = [_name_sample(tick) for tick in (first.logged, first.computed)]
+            change = f"the sample of {peer} in use was {samples[0]}, is {samples[1]}"
         lines.append(f"the first difference is at {when}: {change}")
     if effect.diverged_at_s is not None:
         lines.append(f"diverged at {effect.diverged_at_s:.3f} s and ends there")

@@ -334,8 +334,8 @@ def _describe_shares(scenario: Scenario) -> list[str]:
         pairs = zip(scenario.names, beta, strict=True)
         weights = ", ".join(f"{name} {len(beta) * pi:.4g}" for name, pi in pairs)
     lines = [
-        f"weights of the sites in the proof of stability, sum {len(scenario.names)} (beta, if "
-        f"all have the same Kd): {weights}"
+        "weights of the sites in the proof of stability, pi with the sum "
+        f"{len(scenario.names)} (these are beta if all have the same Kd): {weights}"
     ]
     if beta is not None and np.ptp(beta) >= ROW_SUM_TOLERANCE:
         lines.append(COUPLED_OPERATORS)

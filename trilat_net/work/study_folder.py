@@ -19,13 +19,13 @@ import os
 import zlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, BinaryIO, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 import tomli_w
 
 from ..core.step.fingerprint import compute_fingerprint
-from ..errors import ScenarioError, join_arguments
+from ..errors import LogRefused, ScenarioError, count_nouns, join_arguments
 from ..files import describe_write_error, extend_file
 from ..log.provenance import collect_provenance
 from ..own_code.imported_code import name_law_classes
@@ -170,6 +170,91 @@ T = TypeVar("T")
 E = TypeVar("E", bound=_JournalEntry)
 
 
+class _RunKey(msgspec.Struct, frozen=True):
+    """The fields of a journal entry that identify its run.
+
+    Attributes:
+        cell: Identifier of the part of the study to which the run belongs.
+        seed: Seed of the run's random numbers.
+    """
+
+    cell: Any
+    seed: int
+
+
+_KEYS = msgspec.json.Decoder(_RunKey)
+
+
+def _read_key(text: bytes) -> _RunKey:
+    """Returns which run the JSON text of a journal line belongs to.
+
+    Args:
+        text: The line without its checksum.
+    """
+    try:
+        return _KEYS.decode(text)
+    except msgspec.DecodeError:
+        # The module json accepts infinity, and msgspec does not.
+        return msgspec.convert(json.loads(text), _RunKey)
+
+
+class StoredRuns(Mapping[tuple[Any, int], E]):
+    """Finished runs of a study, by cell and seed, which stay in the file of the journal.
+
+    Only the offsets of the lines are in memory, about 120 bytes for each run, so that a study
+    may have millions of runs. Runs with the same seed are iterated in the order of the lines.
+
+    Args:
+        path: Path of the journal.
+        kind: Type of the entries.
+    """
+
+    def __init__(self, path: Path, kind: type[E]) -> None:
+        self._path = path
+        self._kind = kind
+        self._offsets: dict[int, dict[Any, int]] = {}
+        self._file: BinaryIO | None = None
+
+    def add_offset(self, key: _RunKey, offset: int) -> None:
+        """Notes the offset of a finished run. A known run keeps its first offset.
+
+        Args:
+            key: Cell and seed of the run.
+            offset: Position of its line in the file, in bytes.
+        """
+        self._offsets.setdefault(key.seed, {}).setdefault(key.cell, offset)
+
+    def close(self) -> None:
+        """Closes the file. It is opened again when a run is read."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __getitem__(self, key: tuple[Any, int]) -> E:
+        cell, seed = key
+        offset = self._offsets.get(seed, {})[cell]
+        if self._file is None:
+            self._file = self._path.open("rb")
+        self._file.seek(offset)
+        text, _, _ = self._file.readline().rpartition(b"\t")
+        # The module json is used, because msgspec does not accept infinity.
+        return msgspec.convert(json.loads(text), self._kind)
+
+    def __contains__(self, key: object) -> bool:
+        if not isinstance(key, tuple):
+            return False
+        cell, seed = key
+        return cell in self._offsets.get(seed, ())
+
+    def __iter__(self) -> Iterator[tuple[Any, int]]:
+        for seed, offsets in self._offsets.items():
+            for cell in offsets:
+                yield cell, seed
+
+    def __len__(self) -> int:
+        return sum(map(len, self._offsets.values()))
+
+
 class RunJournal(Generic[E]):
     """File to which a study appends the result of each run as soon as it has finished.
 
@@ -190,17 +275,19 @@ class RunJournal(Generic[E]):
         self._path = path
         self._study = study
         self._remedy = remedy
-        self.done: dict[tuple[Any, int], E] = {}
-        content = path.read_bytes() if path.exists() else b""
-        for line in content.split(b"\n"):
-            text, tab, digits = line.rpartition(b"\t")
-            if tab and digits == b"%08x" % self._checksum(text):
-                # The module json is used, because msgspec does not accept infinity.
-                values = json.loads(text)
-                entry = msgspec.convert(values, kind)
-                self.done.setdefault((entry.cell, entry.seed), entry)
+        self.done: StoredRuns[E] = StoredRuns(path, kind)
+        offset = 0
+        is_torn = False
+        if path.exists():
+            with path.open("rb") as stream:
+                for line in stream:
+                    text, tab, digits = line.removesuffix(b"\n").rpartition(b"\t")
+                    if tab and digits == b"%08x" % self._checksum(text):
+                        self.done.add_offset(_read_key(text), offset)
+                    offset += len(line)
+                    is_torn = not line.endswith(b"\n")
         self._file = extend_file(path)
-        if content and not content.endswith(b"\n"):
+        if is_torn:
             # The last line is torn. It is ended here, so that it does not spoil the next one.
             self._write(b"\n")
 
@@ -210,6 +297,7 @@ class RunJournal(Generic[E]):
     def __exit__(self, *_: object) -> None:
         os.fsync(self._file.fileno())
         self._file.close()
+        self.done.close()
 
     def add(self, entry: E) -> None:
         """Appends the result of a run to the file at once.
@@ -228,8 +316,10 @@ class RunJournal(Generic[E]):
         values = msgspec.to_builtins(entry)
         text = json.dumps(values, separators=(",", ":")).encode()
         checksum = self._checksum(text)
-        self._write(b"%s\t%08x\n" % (text, checksum))
-        self.done[entry.cell, entry.seed] = entry
+        line = b"%s\t%08x\n" % (text, checksum)
+        self._write(line)
+        offset = self._file.tell() - len(line)
+        self.done.add_offset(_RunKey(entry.cell, entry.seed), offset)
 
     def run_pending(
         self,
@@ -241,6 +331,7 @@ class RunJournal(Generic[E]):
         show: Progress,
         together: Together[T, E] | None = None,
         together_count: int = 1,
+        note: Callable[[E], None] | None = None,
     ) -> None:
         """Executes the runs of a study that are not finished yet, and writes each as it ends.
 
@@ -253,9 +344,10 @@ class RunJournal(Generic[E]):
             show: Function that is called with the number of finished runs and `total`.
             together: Function that executes the runs of several tasks at once.
             together_count: Number of tasks that `together` should get.
+            note: Function that is called with each run after it was written.
 
         Raises:
-            LogRefused: The disk is full.
+            LogRefused: The disk is full. The message states how many runs are finished.
         """
         results = pool.iterate_results(
             run,
@@ -265,7 +357,13 @@ class RunJournal(Generic[E]):
             together_count=together_count,
         )
         for number, (_, entry) in enumerate(results, done + 1):
-            self.add(entry)
+            try:
+                self.add(entry)
+            except LogRefused as error:
+                progress = f"{number - 1} of {count_nouns(total, 'run')} had finished"
+                raise LogRefused(f"{error}; {progress}") from None
+            if note is not None:
+                note(entry)
             show(number, total)
 
     def _write(self, data: bytes) -> None:

@@ -211,6 +211,10 @@ class LogComparison(Result):
         yield self._sum_up(rows)
         count = count_nouns(len(self.metrics.rows), "metric")
         yield f"--all prints all {count}, and why numbers are missing"
+        first, *others = (log.source for log in self.logs)
+        if others:
+            files = " ".join(f"--with {file}" for file in others)
+            yield f"to see the runs together: trilat figure {first} {files}"
 
     def _compose_differences(self) -> Iterator[Block]:
         """Yields how the experiments of the logs differ, as a table with a row per difference.
@@ -256,9 +260,10 @@ class LogComparison(Result):
         Args:
             rows: The metrics that differ most.
         """
-        verdicts = [
-            f"{name} is {lines[0].partition(':')[0]}" for name, lines in self.remarks.items()
-        ]
+        verdicts = []
+        for name, lines in self.remarks.items():
+            verdict = lines[0].partition("; rests on")[0].partition(":")[0]
+            verdicts.append(f"{name} is {verdict}")
         text = f"in short: {join_words(verdicts)}"
         if not rows:
             return f"{text}; no metric differs"

@@ -52,6 +52,7 @@ def sweep(
     longest_s: float | None = None,
     judge: str = "verdict",
     metrics: Sequence[str] = (),
+    refine: int = 0,
     out: str | Path | None = None,
     jobs: int | None = None,
     on: "Workers" = None,
@@ -79,11 +80,14 @@ def sweep(
         duration_s: First duration of the runs of a cell, in s.
         longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
             By default eight times `duration_s`, or `duration_s` if `judge` is "twins".
-        judge: "verdict" or "twins". Twins are two runs that differ by a small disturbance. With
-            "twins", the exponent with which the disturbance grows is measured in each cell, in
-            addition to its verdict.
+        judge: "verdict", "twins" or "linear". Twins are two runs that differ by a small
+            disturbance. With "twins", the exponent with which the disturbance grows is measured
+            in each cell, in addition to its verdict. With "linear", no run is made: a cell has
+            the growth rate of its linear loop.
         metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
             columns of the rows.
+        refine: Number of halvings along the stability edge. The sweep begins with every
+            2^refine-th value of the first two numeric axes. 0 runs all cells.
         out: Folder of the results. A sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
         jobs: Number of processes. None uses one per core.
@@ -107,6 +111,7 @@ def sweep(
         longest_s=longest_s,
         judge=judge,
         metrics=metrics,
+        refine=refine,
     )
     folder = prepare_sweep_folder(plan, None if out is None else Path(out))
     return run_sweep(folder, jobs, on=on).results

@@ -55,7 +55,9 @@ def _check_modes(used_options: Sequence[str]) -> None:
         raise UsageError(
             "--tolerance sets the tolerance of a stability limit: use --tolerance with --margin"
         )
-    for name in ("--judge", "--metric"):
+    if "--beside" in used_options and "--map" not in used_options:
+        raise UsageError("--beside draws the edge of another sweep: use --beside with --map")
+    for name in ("--judge", "--metric", "--refine"):
         if name in used_options and "--margin" in used_options:
             raise UsageError(
                 f"{name} applies only to a sweep and the map of a sweep: leave out --margin"
@@ -63,7 +65,12 @@ def _check_modes(used_options: Sequence[str]) -> None:
 
 
 def _draw_map(
-    results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
+    results: "SweepResults",
+    folder: Path,
+    width: float | None,
+    jobs: int | None,
+    on: str | None,
+    beside: Path | None,
 ) -> None:
     """Draws the stability map of a sweep, together with the edges that theory predicts.
 
@@ -73,9 +80,11 @@ def _draw_map(
         width: Width of the map, in inches. None uses one column of a paper.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler that computes the map instead.
+        beside: Folder of another sweep, whose edge is drawn as well. None draws no other edge.
     """
     from trilat_net.presentation.appearance import COLUMN_IN, make_print_size
 
+    from .sweep import read_results
     from .sweep.fixed_gains import FAIR_COMPARISON
     from .sweep.map_page import write_map
     from .sweep.stability_map import build_stability_map
@@ -83,12 +92,16 @@ def _draw_map(
 
     size = make_print_size(COLUMN_IN if width is None else width)
     width_option = [] if width is None else ["--width", f"{width:g}"]
-    command = build_sweep_command(results.plan, "--map", *width_option)
+    beside_option = [] if beside is None else ["--beside", str(beside)]
+    command = build_sweep_command(results.plan, "--map", *width_option, *beside_option)
+    simulated = None if beside is None else read_results(beside)
     terminal.print_text("map: the lines of theory ...")
     with show_progress(
         "linear analysis", terminal.print_text, "columns of the map"
     ) as progress:
-        stability_map = build_stability_map(results, (command,), jobs, progress, on=on)
+        stability_map = build_stability_map(
+            results, (command,), jobs, progress, on=on, simulated=simulated
+        )
 
     terminal.print_texts(f"note: {remark}" for remark in stability_map.remarks)
     terminal.print_text("map: drawing ...")
@@ -165,6 +178,7 @@ def _run_sweep(
     from trilat_net.work.executor import count_workers
 
     from .sweep import sweep_results, sweep_run
+    from .sweep.cell_groups import find_cell_groups
 
     existing_folder = None
     plan = new_plan
@@ -175,6 +189,8 @@ def _run_sweep(
         finished_runs = existing_folder.read_done()
     assert plan is not None  # the caller gives a plan or a folder
     terminal.print_texts(sweep_results.describe_sweep_plan(plan))
+    if plan.judge != "linear":
+        terminal.print_texts(filter(None, [f"  {find_cell_groups(plan).sentence}".rstrip()]))
     if existing_folder is not None:
         done = count_nouns(len(finished_runs), "run is", "runs are")
         terminal.print_text(f"  {done} done already")
@@ -192,7 +208,7 @@ def _run_sweep(
     was_complete = not (estimate.entries or finished.runs)
     if was_complete:
         terminal.out.print("nothing was left to run")
-    remarks = [sweep_run.describe_sweep_speed(finished)] if finished.runs else []
+    remarks = [sweep_run.describe_sweep_speed(finished)] if finished.simulated_s else []
     remarks += filter(None, [sweep_run.describe_runs_alone(finished)])
     remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
     _print_results(finished.results, remarks, folder.path)
@@ -281,8 +297,9 @@ def sweep_command(
     law: Annotated[str | None, value("--law", "LAW,LAW...")] = None,
     duration: options.DurationOption = None,
     longest: Annotated[float | None, value("--longest", "S")] = None,
-    judge: Annotated[str, value("--judge", "verdict|twins")] = "verdict",
+    judge: Annotated[str, value("--judge", "verdict|twins|linear")] = "verdict",
     metric: Annotated[list[str] | None, value("--metric", "KEY")] = None,
+    refine: Annotated[int, _option("--refine", metavar="N", min=0)] = 0,
     output: Annotated[Path | None, value("-o --out", "DIR")] = None,
     resume: Annotated[
         Path | None, value("--resume", "DIR", "Continue the interrupted sweep in this folder.")
@@ -297,6 +314,7 @@ def sweep_command(
         _option("--map", help="Draw the stability map, with the stability limits from theory."),
     ] = False,
     width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
+    beside: Annotated[Path | None, _option("--beside", metavar="FOLDER")] = None,
     margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
     tolerance: Annotated[float, _option("--tolerance", metavar="SHARE")] = 0.005,
     confirm: Annotated[int | None, typer.Option("--confirm", hidden=True)] = None,
@@ -317,14 +335,19 @@ def sweep_command(
         law: Control laws, as a further axis of the grid; default: the law of the scenario.
         longest: Longest run of a cell whose stability is still undecided, s; default: eight
             times the duration, or the duration with --judge twins.
-        judge: Quantity in the map: stability classes (verdict), or growth exponents of runs
-            with a small push (twins), for which short runs suffice.
+        judge: Quantity in the map: stability classes (verdict), growth exponents of runs with
+            a small push (twins), for which short runs suffice, or growth rates of the linear
+            loop, without runs (linear).
         metric: Measure this metric of every run as well (docs/reference/metrics.md);
             repeatable.
+        refine: Begin with every 2^N-th value of the first two numeric axes, then halve the
+            steps N times, only along the stability edge; default 0: run all cells.
         output: Folder for the results; a sweep that the folder already contains is continued.
             Default: runs/sweep-NAME-N, or runs/margin-NAME-N with --margin.
         cell: For an earlier sweep: print the commands that write the logs of this cell.
         width: Width of the map in inches: one or two columns of a paper; default: one column.
+        beside: With --map: draw also the edge of the finished sweep in this folder, over the
+            same axes.
         margin: Instead of a full sweep, search for the stability limit in this range of a
             scenario key, at every point of the grid.
         tolerance: Largest uncertainty of a stability limit that --margin finds, relative to its
@@ -342,7 +365,7 @@ def sweep_command(
         )
     _check_modes(used_options)
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
-    draw = partial(_draw_map, width=width, jobs=jobs, on=on)
+    draw = partial(_draw_map, width=width, jobs=jobs, on=on, beside=beside)
 
     uses_finished_sweep = cell is not None or resume is not None or results is not None
     if uses_finished_sweep:
@@ -383,6 +406,7 @@ def sweep_command(
             longest_s=longest,
             judge=judge,
             metrics=metric or (),
+            refine=refine,
         )
         if search_range is not None:
             return _search_margins(
@@ -433,6 +457,7 @@ _PLAN_OPTIONS = (
     "--longest",
     "--judge",
     "--metric",
+    "--refine",
     "--set",
     "--duration",
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import trilat_net
+from tests import metric_labels
 from tests.dropped_files import look
 from trilat_net.analysis.metrics.log_metrics import find_quantity
 from trilat_net.analysis.metrics.measures import list_measures, measures
@@ -71,3 +72,8 @@ def test_a_measure_gives_its_declared_quantities(name: str) -> None:
             assert set(measure.measure(view, subject)) == {
                 quantity.key for quantity in measure.quantities
             }
+
+
+def test_every_printed_label_is_documented() -> None:
+    """The table of docs/reference/metrics.md has the label, key and unit of every metric."""
+    assert metric_labels.TABLE.read_text(encoding="utf-8") == metric_labels.build_table()

@@ -158,7 +158,7 @@ class LinearAnalysis(Result):
                 "their modes keep their speed"
             )
         if lacks_detailed_balance(self.scenario):
-            notes.append(IRREVERSIBLE_SHARES)
+            notes.append(IRREVERSIBLE_SHARES.removeprefix("note: "))
         ticks_grow = self.sampled is not None and self.sampled.verdict == "unstable"
         return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
 

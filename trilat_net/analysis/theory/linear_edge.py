@@ -60,6 +60,12 @@ ASSUMED_EQUILIBRIUM_REMARK = (
 )
 
 
+MEAN_POSE_REMARK = (
+    "about the rest that is nearest to the mean start pose: where estimates, operators and "
+    "walls move the arms to, only a run shows"
+)
+
+
 def find_rightmost_root(
     conditions: OperatingConditions,
     rest: Equilibrium,
@@ -375,17 +381,22 @@ class GrowthColumn(NamedTuple):
         edges: Values at which stability changes. The key n means that the change lies between
             the values n and n + 1.
         remarks: Remarks for the user on the analysis, each once.
+        is_sampled: True if a root is that of a Floquet multiplier of the loop with its ticks,
+            False if the loops were analysed in continuous time.
     """
 
     growth_per_s: list[float]
     edges: dict[int, float]
     remarks: list[str]
+    is_sampled: bool = False
 
 
 def compute_growth_column(
     scenarios: Sequence[Scenario],
     key: str,
     values: Sequence[float],
+    *,
+    at_mean_pose: bool = False,
 ) -> GrowthColumn:
     """Computes how the growth of small motions depends on one setting of a scenario.
 
@@ -397,6 +408,8 @@ def compute_growth_column(
         scenarios: The experiments, which differ in the setting only, by its rising value.
         key: Name of the setting, such as "control.d".
         values: Values of the setting, one per scenario.
+        at_mean_pose: True to linearise each scenario about the rest that is nearest to the mean
+            of its start poses, with true estimates. No run is simulated then.
 
     Returns:
         The growth rates, and the values at which stability changes. A value of change is
@@ -406,9 +419,14 @@ def compute_growth_column(
     column = GrowthColumn([], {}, [])
     for n, scenario in enumerate(scenarios):
         try:
-            rest, remark = _assume_equilibrium(scenario, rest)
+            if at_mean_pose:
+                rest, remark = _find_mean_equilibrium(scenario)
+            else:
+                rest, remark = _assume_equilibrium(scenario, rest)
             conditions = derive_operating_conditions(scenario)
-            root = find_rightmost_root(conditions, rest, sampled=conditions.needs_sampled_loop)
+            is_sampled = conditions.needs_sampled_loop and not conditions.has_forms
+            column = column._replace(is_sampled=column.is_sampled or is_sampled)
+            root = find_rightmost_root(conditions, rest, sampled=is_sampled)
             column.growth_per_s.append(-np.inf if root is None else root.s.real)
             if n > 0:
                 left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
@@ -454,6 +472,23 @@ def find_root_crossings(
         return tuple(edge.value for edge in edges), remark
     except ScenarioError as error:
         return (), f"no linear analysis: {error.problem}"
+
+
+def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
+    """Returns the equilibrium that is nearest to the mean of the start poses.
+
+    Args:
+        scenario: The experiment.
+
+    Returns:
+        The equilibrium.
+        A remark on the assumption. Empty if all arms and nothing else decide where they rest.
+    """
+    mean = find_equilibrium(scenario, find_mean_pose(scenario))
+    rest = follow_equilibrium(scenario, mean)
+    sites = derive_operating_conditions(scenario).sites
+    is_moved = any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites)
+    return rest, MEAN_POSE_REMARK if is_moved else ""
 
 
 def _assume_equilibrium(

@@ -7,6 +7,7 @@ Invariant:
     - Two runs with the same structure use the same compiled code and the same number tables.
 """
 
+from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import numba
@@ -154,3 +155,16 @@ def find_structure(run: FusedRun) -> RunStructure:
         duration_s=run.scenario.duration_s,
         settled_rad=memory.settled_rad,
     )
+
+
+def describe_structure(run: FusedRun) -> Hashable:
+    """Returns a value that is equal for runs which differ in numbers only.
+
+    Args:
+        run: The run before its first tick.
+
+    Returns:
+        The obstacle to computing the run together with others. Without an obstacle, its
+        structure.
+    """
+    return find_obstacle(run) or find_structure(run)

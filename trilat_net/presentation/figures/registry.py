@@ -265,6 +265,8 @@ def _find_figure(log: Log, name: str) -> FigureEntry:
     Raises:
         UsageError: There is no such figure, or the log has nothing to show in it.
     """
+    if name == OVERLAY:
+        raise UsageError("overlay shows several runs in one figure: add --with FILE")
     if name not in FIGURES:
         hint = suggest_nearest(name, list(FIGURES))
         if not hint:

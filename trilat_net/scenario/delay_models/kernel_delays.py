@@ -75,6 +75,12 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
             kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms
         )
 
+    def _describe_delay(self) -> str:
+        """Returns the limits of the delay, for example "uniform 0 to 400 ms"."""
+        least_ms = self.delay_ms - self.half_width_ms
+        most_ms = self.delay_ms + self.half_width_ms
+        return f"uniform {least_ms:.4g} to {most_ms:.4g} ms"
+
     def _moments(self) -> tuple[float, float]:
         """Returns the moments. The standard deviation is half_width / sqrt(3)."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)

@@ -49,8 +49,8 @@ def test_short_text_has_verdicts_metrics_and_conclusion(logs: Path) -> None:
     assert all(any(name in line for line in full) for name in names)
     for log, (verdict, *_) in facts["remarks"].items():
         assert sum(f"{log}: {verdict}" in line for line in brief) == 1
-    assert brief[-2].startswith(f"in short: a is {verdict.partition(':')[0]} and b is ")
-    assert f"--all prints all {len(names)} metrics" in brief[-1]
+    assert brief[-3].startswith(f"in short: a is {verdict.partition(':')[0]} and b is ")
+    assert f"--all prints all {len(names)} metrics" in brief[-2]
 
 
 def test_other_links_bring_the_undelayed_error(logs: Path) -> None:
@@ -61,7 +61,7 @@ def test_other_links_bring_the_undelayed_error(logs: Path) -> None:
     assert any(line.strip().startswith(f"{row['name']}  ") for line in brief)
     first, second = row["values"]
     clause = f"delay included, a site is at most {first:.3g} rad in a and {second:.3g} rad in b"
-    assert clause in brief[-2]
+    assert clause in brief[-3]
     other_law = trilat("compare", "a.mcap", "hang.mcap", cwd=logs).succeeds()
     assert "delay included" not in other_law
 

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shlex
 from pathlib import Path
 
@@ -9,13 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trilat_studies.sweep import sweep_cell
-from trilat_studies.sweep.sweep_cell import apply_diff, diff_lines
+from trilat_studies.sweep.sweep_cell import CellClass, apply_diff, diff_lines
 from trilat_studies.sweep.sweep_results import build_sim_command
 from trilat_studies.sweep.sweep_run import CellItem, run_cell
 
 from sweep_tests.quick import Judge, plan_quick_sweep
 from trilat_net.app.cli.options import load_chosen_scenario
-from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
 
 
@@ -65,13 +65,13 @@ def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
     )
 
 
-def test_a_cell_without_valid_scenario_is_named(tmp_path: Path) -> None:
+def test_a_cell_without_valid_scenario_is_refused(tmp_path: Path) -> None:
     plan = plan_quick_sweep(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
-    with pytest.raises(
-        ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"
-    ):
-        run_cell(CellItem(plan, cell, 1))
+    outcome = run_cell(CellItem(plan, cell, 1)).outcome
+    assert outcome.verdict is CellClass.REFUSED
+    assert outcome.verdict.stable is None
+    assert re.match(r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd", outcome.reasons)
 
 
 texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)

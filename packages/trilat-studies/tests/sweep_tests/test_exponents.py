@@ -109,7 +109,7 @@ def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
     exponents = build_plane(seeded, KEYS, P_D).panels[0].exponents_per_s
     assert np.isnan(exponents[0, 0])
     assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
-    assert not build_plane(list(rows()), KEYS, P_D).judged_by_twins
+    assert not build_plane(list(rows()), KEYS, P_D).has_exponents
 
 
 def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="another judge: verdict in the folder, twins now"):
         prepare_sweep_folder(longest, tmp_path / "o")
     assert (twins.longest_s, verdicts.longest_s) == (0.5, 4.0)
-    with pytest.raises(UsageError, match="verdict, twins, not 'luck'"):
+    with pytest.raises(UsageError, match="verdict, twins, linear, not 'luck'"):
         plan_quick_sweep(tmp_path, judge="luck")
 
 

@@ -172,6 +172,15 @@ def test_invalid_axes_are_refused_before_any_run(
         assert word in problem
 
 
+def test_a_single_invalid_corner_is_allowed(tmp_path: Path) -> None:
+    """Bursts of 1.5 samples are too short for a loss of 0.7, which is valid with longer ones."""
+    plan = plan_quick_sweep(tmp_path, over=["link.loss=0.1,0.7", "link.loss_burst=5,1.5"])
+    with pytest.raises(ScenarioError, match="too short"):
+        plan.scenario(*plan.cell(3).overrides)
+    swapped = plan_quick_sweep(tmp_path, over=["link.loss=0.7,0.1", "link.loss_burst=1.5,5"])
+    assert swapped.cells == 4
+
+
 def test_a_key_without_effect_is_refused(tmp_path: Path) -> None:
     text = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
     (tmp_path / "own.toml").write_text(text)

@@ -1,11 +1,13 @@
 """Runs of a sweep: results do not depend on how they were made, and every run is made and counted once."""
 
+import re
+import resource
 from collections import Counter
 from pathlib import Path
 
 import pytest
-from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
-from trilat_studies.sweep.sweep_cell import CellClass
+from trilat_studies.sweep import prepare_sweep_folder, read_results, run_sweep, sweep_cell
+from trilat_studies.sweep.sweep_cell import RUN_CLASSES
 from trilat_studies.sweep.sweep_plan import plan_sweep
 from trilat_studies.sweep.sweep_results import (
     RESULTS_FILE,
@@ -19,7 +21,7 @@ from trilat_studies.sweep.sweep_run import (
     refuse_oversized_sweep,
 )
 
-from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.errors import LogRefused, UsageError
 
 from .quick import DELAYS, Judge, plan_quick_sweep
 
@@ -131,19 +133,58 @@ def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
     assert len(judge.texts) == 8
 
 
-def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
+def test_only_cells_that_cannot_run_are_refused(tmp_path: Path, judge: Judge) -> None:
     """The ends of both axes are valid alone and together; one pair between them is not."""
     sweep = plan_quick_sweep(
         tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"]
     )
     folder = prepare_sweep_folder(sweep, tmp_path / "o")
-    with pytest.raises(
-        ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"
-    ):
-        run_sweep(folder, 1)
-    with folder.journal() as journal:
-        assert sorted(journal.done) == [(n, 1) for n in range(4)]
-    assert judge.texts
+    results = run_sweep(folder, 1).results
+    (refused,) = (row for row in results.rows if row["verdict"] == "refused")
+    assert len(results.rows) == 9
+    assert refused["cell"] == 4
+    name = r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"
+    assert re.match(name, refused["reasons"])
+    assert read_results(folder.path).rows == results.rows
+    assert len(judge.texts) == 8
+    first, second, *_ = summarize_sweep(results)
+    assert first.endswith(", 1 refused")
+    assert re.match(f"  {name}", second)
+
+
+def test_a_full_disk_names_the_finished_runs(tmp_path: Path, judge: Judge) -> None:
+    """A limit on the size of files stands for the disk; with room, the sweep goes on."""
+    folder = prepare_sweep_folder(plan_quick_sweep(tmp_path), tmp_path / "o")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, limits[1]))
+    try:
+        with pytest.raises(LogRefused) as error:
+            run_sweep(folder, 1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    finished = len(folder.read_done())
+    assert 0 < finished < 12
+    assert f"{finished} of 12 runs had finished" in str(error.value)
+    assert "make room, and continue with: trilat sweep --resume" in str(error.value)
+    assert not (folder.path / RESULTS_FILE).exists()
+    judge.texts.clear()
+    results = run_sweep(folder, 1).results
+    assert (len(results.rows), len(judge.texts)) == (12, 12 - finished)
+
+
+def test_a_full_disk_at_the_table_says_so(tmp_path: Path, judge: Judge) -> None:
+    folder = prepare_sweep_folder(plan_quick_sweep(tmp_path), tmp_path / "o")
+    run_sweep(folder, 1)
+    (folder.path / RESULTS_FILE).unlink()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, limits[1]))
+    try:
+        with pytest.raises(LogRefused, match="all runs had finished"):
+            run_sweep(folder, 1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert sorted(path.name for path in folder.path.iterdir()) == ["cells.journal", "plan.json"]
+    assert len(judge.texts) == 12
 
 
 def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
@@ -172,7 +213,7 @@ def test_a_summary_counts_every_run_once(
     assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")
     counts = [int(part.split()[0]) for part in first.partition(": ")[2].split(", ")]
     assert counts == [
-        sum(row["verdict"] == verdict for row in results.rows) for verdict in CellClass
+        sum(row["verdict"] == verdict for row in results.rows) for verdict in RUN_CLASSES
     ]
     assert sum(counts) == len(results.rows)
     text = "\n".join(others)

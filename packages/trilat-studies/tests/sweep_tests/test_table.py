@@ -9,8 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from trilat_studies.sweep import prepare_sweep_folder, read_results, run_sweep, sweep_cell
-from trilat_studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
+from trilat_studies.sweep import (
+    prepare_sweep_folder,
+    read_results,
+    result_table,
+    run_sweep,
+    sweep_cell,
+)
+from trilat_studies.sweep.sweep_cell import RUN_CLASSES, CellRun, diff_lines
 from trilat_studies.sweep.sweep_plan import plan_sweep
 from trilat_studies.sweep.sweep_results import (
     GRID_POINTS_FILE,
@@ -60,6 +66,26 @@ def test_the_read_runs_are_the_written_ones(
         assert (
             f'order = "{row["link.order"]}"' in row["scenario"] or row["link.order"] == "newest"
         )
+
+
+def test_a_large_table_stays_in_its_file(
+    finished_sweep: tuple[Path, SweepResults, Judge], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, results, _ = finished_sweep
+    monkeypatch.setattr(result_table, "ROWS_IN_MEMORY", 3)
+    stored = read_results(path)
+    assert isinstance(stored.rows, result_table.StoredRows)
+    assert stored.rows == results.rows
+    assert list(stored.rows) == list(results.rows)
+    assert [stored.rows[n] for n in range(-1, len(stored.rows))] == [
+        results.rows[n] for n in range(-1, len(results.rows))
+    ]
+    assert stored.rows[2:5] == results.rows[2:5]
+    assert stored.of_cell(3) == results.of_cell(3)
+    assert list(stored.blocks()) == list(results.blocks())
+    assert collect_grid_points(stored) == collect_grid_points(results)
+    with pytest.raises(IndexError):
+        stored.rows[len(stored.rows)]
 
 
 def test_rows_are_ordered_by_cells_and_seeds(
@@ -256,7 +282,7 @@ def test_random_cells_have_rows_of_shares(points: list[GridPoint], tmp_path: Pat
         row = {
             name: float(text) if text and name != "law" else None for name, text in line.items()
         }
-        assert tuple(row[verdict.value] for verdict in CellClass) == point.counts
+        assert tuple(row[verdict.value] for verdict in RUN_CLASSES) == point.counts
         assert (row["link.loss"], row["link.delay_ms"]) == point.values
         assert (row["stable_share_low"], row["stable_share_high"]) == point.interval
         if point.decided:

@@ -828,7 +828,7 @@ def run_bench(
             if run.needs_confirmation:
                 repeated.append(item._replace(to_s=run.confirmation_s))
         _run_pending(journal, repeated, jobs, on, progress)
-        return BenchResults(plan, journal.done)
+        return BenchResults(plan, dict(journal.done))
 
 
 def _run_pending(

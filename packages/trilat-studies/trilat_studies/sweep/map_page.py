@@ -39,6 +39,7 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 
 from trilat_net.core.step.vectors import Array
+from trilat_net.errors import count_nouns
 from trilat_net.files import write_whole
 from trilat_net.presentation import style
 from trilat_net.presentation.appearance import COLUMN_IN, FigureSize, make_print_size
@@ -54,7 +55,9 @@ from .stability_map import (
     StabilityEdge,
     StabilityMap,
     compute_borders,
+    fill_panel,
     find_map_edges,
+    thin_axis,
 )
 from .sweep_cell import CellClass
 
@@ -95,6 +98,10 @@ _SHARES = LinearSegmentedColormap.from_list(
     ],
 )
 """Colours of stable shares: dark if nothing is stable, lighter with a larger share."""
+_VERDICTS_EDGE = "edge of the verdicts"
+"""Name of the measured edges of the classes, in the legend and in the table."""
+_SIMULATED_EDGE = "edge of the simulation"
+"""Name of the measured edges of another sweep."""
 _HALO_PT = 2.6
 """Width of the white halo around a line."""
 _COUNT_PT = 5.0
@@ -148,7 +155,7 @@ def draw_stability_map(
     caption_height_in = _CAPTION_LINE_IN * len(caption)
     height_in = 0.95 + rows * panel_height_in + caption_height_in
     shares_labels = columns * rows > 1
-    has_colour_bar = plane.judged_by_twins or plane.seeds > 1
+    has_colour_bar = plane.has_exponents or plane.seeds > 1
 
     with style.styled_figure(form, height_in) as figure:
         x_label_options: dict[str, Any] = {}
@@ -191,7 +198,7 @@ def draw_stability_map(
         # fit into it.
         canvas = FigureCanvasAgg(figure)
         figure.draw(canvas.get_renderer())  # type: ignore[no-untyped-call]
-        shows_shares = plane.seeds > 1 and not plane.judged_by_twins
+        shows_shares = plane.seeds > 1 and not plane.has_exponents
         if shows_shares:
             for axes, panel in zip(grid, plane.panels, strict=False):
                 _draw_counts(axes, plane, panel)
@@ -289,10 +296,12 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
     """
     axes.grid(visible=False)
     axes.set_facecolor(_EMPTY_COLOUR)
-    _draw_cells(axes, plane, panel)
-    if plane.judged_by_twins:
-        _draw_verdict_edges(axes, plane, panel)
-    _hatch_undecided(axes, plane, panel)
+    filled = fill_panel(panel) if plane.halvings else panel
+    _draw_cells(axes, plane, filled)
+    _draw_edges(axes, plane, panel.simulated)
+    if plane.has_exponents and not plane.is_linear:
+        _draw_edges(axes, plane, find_map_edges(plane, panel))
+    _hatch_undecided(axes, plane, filled)
     for line in lines:
         _draw_line(axes, plane, line)
 
@@ -310,7 +319,7 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """
     colours: dict[str, Any]
     values: Any
-    if plane.judged_by_twins:
+    if plane.has_exponents:
         limit = _find_exponent_limit(plane)
         values = np.ma.masked_invalid(panel.exponents_per_s)
         colours = {"cmap": _EXPONENTS, "vmin": -limit, "vmax": limit}
@@ -353,8 +362,10 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
             axes.fill_between(sides, bottom, top, zorder=1.5, **_HATCHED)
 
 
-def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Draws where the runs change between stable and not stable, in each column.
+def _draw_edges(
+    axes: Axes, plane: MapPlane, edges: Sequence[tuple[float, StabilityEdge]]
+) -> None:
+    """Draws where runs change between stable and not stable, in each column.
 
     The edge of a column lies between two grid points, and is drawn as a vertical line between
     them. On a map of growth exponents the lines show whether both ways of judging agree.
@@ -362,9 +373,9 @@ def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     Args:
         axes: The panel of the figure.
         plane: Axes of the map.
-        panel: Results of the panel.
+        edges: The edges, with the value of x of their columns.
     """
-    for x_value, edge in find_map_edges(plane, panel):
+    for x_value, edge in edges:
         x = _find_position(plane.x, x_value)
         low = _find_position(plane.y, edge.low)
         high = _find_position(plane.y, edge.high)
@@ -497,7 +508,7 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
         Flags, shape (y, x).
     """
     has_runs = panel.runs > 0
-    if plane.judged_by_twins:
+    if plane.has_exponents:
         return has_runs & np.isnan(panel.exponents_per_s)
     class_index = CELL_CLASSES.index(CellClass.UNDECIDED)
     undecided = panel.counts[:, :, class_index]
@@ -546,7 +557,9 @@ def _find_exponent_limit(plane: MapPlane) -> float:
     The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed it,
     so that a few large exponents do not make all others pale.
     """
-    exponents = [panel.exponents_per_s.ravel() for panel in plane.panels]
+    # The cells that ran in a refined sweep lie along the edge, where exponents are small.
+    panels = map(fill_panel, plane.panels) if plane.halvings else plane.panels
+    exponents = [panel.exponents_per_s.ravel() for panel in panels]
     magnitudes = np.abs(np.concatenate(exponents))
     quantile = float(np.nanquantile(magnitudes, 0.8))
     least = max(quantile, 1e-6)
@@ -569,11 +582,13 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
         grid: All panels, beside which the bar stands.
         plane: The measured part of the map.
     """
-    if plane.judged_by_twins:
+    if plane.has_exponents:
         limit = _find_exponent_limit(plane)
         colours = ScalarMappable(cmap=_EXPONENTS)
         colours.set_clim(-limit, limit)
         label = "growth exponent of a push (1/s)"
+        if plane.is_linear:
+            label = "growth rate of small motions (1/s)"
         pointed = "both"
     else:
         colours = ScalarMappable(cmap=_SHARES)
@@ -589,7 +604,7 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
         aspect=30,
         extend=pointed,
     )
-    if plane.judged_by_twins:
+    if plane.has_exponents:
         half = 0.5 * limit
         bar.set_ticks([-limit, -half, 0.0, half, limit])
     bar.set_label(label)
@@ -638,16 +653,18 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
         lines: Lines of each panel.
     """
     handles: list[Any] = []
-    if plane.judged_by_twins:
-        if any(find_map_edges(plane, panel) for panel in plane.panels):
-            edge_handle = Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE)
-            handles.append(edge_handle)
+    if any(panel.simulated for panel in plane.panels):
+        handles.append(Line2D([], [], label=_SIMULATED_EDGE, **_VERDICT_EDGE))
+    if plane.has_exponents:
+        has_edges = any(find_map_edges(plane, panel) for panel in plane.panels)
+        if has_edges and not plane.is_linear:
+            handles.append(Line2D([], [], label=_VERDICTS_EDGE, **_VERDICT_EDGE))
     elif plane.seeds == 1:
         handles += _list_class_handles(plane)
 
     undecided_by_panel = [_find_undecided(plane, panel) for panel in plane.panels]
     if any(undecided.any() for undecided in undecided_by_panel):
-        if plane.judged_by_twins:
+        if plane.has_exponents:
             label = "no exponent"
         elif plane.seeds > 1:
             label = "half or more undecided"
@@ -655,6 +672,11 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
             label = CellClass.UNDECIDED.value
         look = {**_HATCHED, "linewidth": 0.5}
         handles.append(Patch(label=label, **look))
+
+    if plane.refused:
+        handles.append(Patch(label=CellClass.REFUSED.value, facecolor=_EMPTY_COLOUR))
+    if plane.halvings:
+        handles.append(Patch(label=describe_refined_cells(plane), visible=False))
 
     # Panels may share a line, which has one entry.
     line_of_label = {}
@@ -766,12 +788,28 @@ def _list_notes(chart: StabilityMap) -> list[str]:
             origin = f"{line.text}: {line.about}"
             origins.append(origin)
     notes = [*dict.fromkeys(origins), *chart.remarks]
+    plane = chart.plane
+    if plane.halvings:
+        notes.append(
+            f"{describe_refined_cells(plane)}, along the edge; the others are drawn "
+            "like their neighbours, and the table has the columns of the coarse grid"
+        )
+    if plane.refused:
+        refused = count_nouns(plane.refused, "cell")
+        notes.append(f"refused, and without runs: {refused}, not valid as scenarios")
     notes += [f"gains that were not swept: {text}" for text in chart.fixed]
     if chart.fixed:
         command = "trilat compare --tune"
         comparison = FAIR_COMPARISON.replace(command, f"`{command}`")
         notes.append(comparison)
     return notes
+
+
+def describe_refined_cells(plane: MapPlane) -> str:
+    """Returns how many cells of a refined sweep ran, as in "1243 of 40401 cells ran"."""
+    ran = sum(int((panel.runs > 0).sum()) for panel in plane.panels)
+    cells = sum(panel.runs.size for panel in plane.panels)
+    return f"{ran} of {count_nouns(cells, 'cell')} ran"
 
 
 def tabulate_classes(plane: MapPlane) -> TextTable:
@@ -807,14 +845,18 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     """
     theory = [line for line in lines if line.rank >= 0]
     heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
-    if plane.judged_by_twins:
-        heads.append("edge of the verdicts")
+    has_simulation = any(panel.simulated for panel in plane.panels)
+    has_verdicts = plane.has_exponents and not plane.is_linear
+    if has_verdicts:
+        heads.append(_VERDICTS_EDGE)
+    if has_simulation:
+        heads.append(_SIMULATED_EDGE)
     for line in theory:
         heads += [line.text, "difference"]
 
     verdict_edges = find_map_edges(plane, panel)
     edges = verdict_edges
-    if plane.judged_by_twins:
+    if plane.has_exponents:
         edges = []
         for line in lines:
             is_measured = line.rank < 0
@@ -822,13 +864,18 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
                 edges += _list_crossings(line, plane)
 
     rows = []
+    columns = thin_axis(plane.x, plane.halvings).values
     for x, edge in edges:
+        if x not in columns:
+            continue
         stable_side = "below" if edge.stable_below else "above"
         row = [f"{x:g}", _format_edge(edge), stable_side]
-        if plane.judged_by_twins:
+        if has_verdicts:
             column_edges = [other for other_x, other in verdict_edges if other_x == x]
-            nearest_text = _format_nearest_edge(edge.low, column_edges)
-            row.append(nearest_text)
+            row.append(_format_nearest_edge(edge.low, column_edges))
+        if has_simulation:
+            column_edges = [other for other_x, other in panel.simulated if other_x == x]
+            row.append(_format_nearest_edge(edge.low, column_edges))
         column = plane.x.values.index(x)
         for line in theory:
             crossings = line.crossings(column, plane.y)

@@ -50,7 +50,7 @@ from trilat_net.scenario.key_checks import is_number
 from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
 
 from .fixed_gains import describe_fixed_gains
-from .sweep_cell import CellClass
+from .sweep_cell import RUN_CLASSES, CellClass
 from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
 from .sweep_results import SweepResults
 
@@ -58,7 +58,7 @@ RunCounts = NDArray[np.int64]
 PanelSettings = tuple[tuple[str, Any], ...]
 """Values of the axes that are not drawn, as pairs of a key and a value."""
 
-CELL_CLASSES = tuple(CellClass)
+CELL_CLASSES = RUN_CLASSES
 """Classes of a run, in the order of the last dimension of `MapPanel.counts`."""
 MAX_PANELS = 12
 """Largest number of panels of a map, so that the panels remain legible."""
@@ -114,12 +114,15 @@ class MapPanel(NamedTuple):
         exponents_per_s: Growth exponent of each grid point, the mean over its seeds, in 1/s,
             shape (y, x). It is the rate at which a small disturbance grows; NaN if it was not
             measured.
+        simulated: Measured limits of stability of another sweep, which simulated its cells, as
+            pairs of a value of x and an interval of y.
     """
 
     title: str
     settings: PanelSettings
     counts: RunCounts
     exponents_per_s: Array
+    simulated: tuple[tuple[float, "StabilityEdge"], ...] = ()
 
     @property
     def runs(self) -> RunCounts:
@@ -169,19 +172,26 @@ class MapPlane(NamedTuple):
         x: Horizontal axis.
         y: Vertical axis.
         panels: One panel per setting of the axes that are not drawn.
+        halvings: Number of halvings of a sweep that ran only the grid points along the
+            stability edge. 0 if all grid points have runs.
+        is_linear: True if the exponents are roots of the linear loop, and nothing was run.
+        refused: Number of grid points that are not valid scenarios. They have no runs.
     """
 
     scenario: str
     x: PlaneAxis
     y: PlaneAxis
     panels: tuple[MapPanel, ...]
+    halvings: int = 0
+    is_linear: bool = False
+    refused: int = 0
 
     @property
-    def judged_by_twins(self) -> bool:
-        """True if the sweep measured growth exponents instead of judging the end of each run.
+    def has_exponents(self) -> bool:
+        """True if the sweep has growth exponents instead of the end of each run.
 
         A growth exponent is the rate at which a small disturbance grows, in 1/s. It is measured
-        by twins: repeated runs with a small push.
+        by twins, repeated runs with a small push, or is a root of the linear loop.
         """
         return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
 
@@ -191,13 +201,49 @@ class MapPlane(NamedTuple):
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
+def fill_panel(panel: MapPanel) -> MapPanel:
+    """Gives every grid point without runs the class of the nearest one, for drawing.
+
+    Growth exponents are interpolated linearly between the grid points that have one.
+
+    Args:
+        panel: Panel of the map of a refined sweep.
+    """
+    from scipy.interpolate import griddata
+    from scipy.ndimage import distance_transform_edt
+
+    def fill_nearest(is_missing: Any) -> Any:
+        """Returns the indices of the nearest grid point that is not missing."""
+        return distance_transform_edt(is_missing, return_distances=False, return_indices=True)
+
+    if not panel.runs.any():
+        return panel
+    rows, columns = fill_nearest(panel.runs == 0)
+    exponents_per_s = panel.exponents_per_s
+    if np.isfinite(exponents_per_s).any():
+        known = np.argwhere(np.isfinite(exponents_per_s))
+        places = np.indices(exponents_per_s.shape).reshape(2, -1).T
+        filled = exponents_per_s[tuple(fill_nearest(np.isnan(exponents_per_s)))]
+        has_area = min(np.ptp(known, axis=0)) > 0
+        if has_area:
+            values = exponents_per_s[tuple(known.T)]
+            inside = griddata(known, values, places).reshape(exponents_per_s.shape)
+            filled = np.where(np.isfinite(inside), inside, filled)
+        exponents_per_s = filled
+    return panel._replace(counts=panel.counts[rows, columns], exponents_per_s=exponents_per_s)
+
+
 def build_plane(
-    rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario
+    rows: Sequence[Mapping[str, Any]],
+    axes: Sequence[str],
+    scenario: Scenario,
+    grid: Mapping[str, Sequence[Any]] | None = None,
 ) -> MapPlane:
     """Arranges the runs of a sweep for a map over two of the swept parameters.
 
     The axes are the first two swept keys with numeric values. Each combination of the other
-    keys gets a panel of its own.
+    keys gets a panel of its own. Rows are read one after the other, so that they need not fit
+    into memory.
 
     Args:
         rows: One mapping per run. It has a value for each swept key, the result of the run
@@ -206,6 +252,7 @@ def build_plane(
         axes: The swept keys, in the order of the sweep. The key "law" stands for the control
             law, if several laws were swept.
         scenario: The swept scenario, from which the labels are taken.
+        grid: All values of each swept key. None collects them from the rows.
 
     Returns:
         The axes and the panels.
@@ -216,7 +263,9 @@ def build_plane(
     """
     if not rows:
         raise UsageError("no cell has run: there is nothing to draw")
-    numeric_keys = [key for key in axes if all(is_number(row[key]) for row in rows)]
+    if grid is None:
+        grid = {key: list(dict.fromkeys(row[key] for row in rows)) for key in axes}
+    numeric_keys = [key for key in axes if all(map(is_number, grid[key]))]
     drawn_keys = numeric_keys[:2]
     if not drawn_keys:
         raise UsageError(
@@ -224,10 +273,9 @@ def build_plane(
             f"{', '.join(axes)}"
         )
 
-    values = {key: {row[key] for row in rows} for key in axes}
     plane_axes = []
     for key in drawn_keys:
-        axis_values = tuple(sorted(values[key]))
+        axis_values = tuple(sorted(grid[key]))
         label = label_axis(key, scenario)
         plane_axes.append(PlaneAxis(key, axis_values, label))
     if len(plane_axes) == 1:
@@ -236,61 +284,73 @@ def build_plane(
     x, y = plane_axes
 
     other_keys = [key for key in axes if key not in drawn_keys]
-    panel_keys = [key for key in other_keys if len(values[key]) > 1]
-    rows_of_panel: dict[PanelSettings, list[Mapping[str, Any]]] = {}
+    panel_keys = [key for key in other_keys if len(grid[key]) > 1]
+    runs_of_panel: dict[PanelSettings, _PanelRuns] = {}
+    refused = 0
     for row in rows:
         settings = tuple((key, row[key]) for key in panel_keys)
-        panel_rows = rows_of_panel.setdefault(settings, [])
-        panel_rows.append(row)
-    if len(rows_of_panel) > MAX_PANELS:
-        raise UsageError(
-            f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would give "
-            f"{len(rows_of_panel)}: sweep fewer values of the axes that are not drawn"
-        )
+        if settings not in runs_of_panel and len(runs_of_panel) == MAX_PANELS:
+            count = math.prod(len(grid[key]) for key in panel_keys)
+            raise UsageError(
+                f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would "
+                f"give {count}: sweep fewer values of the axes that are not drawn"
+            )
+        if settings not in runs_of_panel:
+            runs_of_panel[settings] = _PanelRuns(x, y)
+        if row["verdict"] == CellClass.REFUSED:
+            refused += 1
+        else:
+            runs_of_panel[settings].add(row)
 
     panels = []
-    for settings, panel_rows in rows_of_panel.items():
+    for settings, runs in runs_of_panel.items():
         title = _format_panel_title(settings, scenario)
-        counts, exponents_per_s = _collect_runs(panel_rows, x, y)
-        panel = MapPanel(title, settings, counts, exponents_per_s)
-        panels.append(panel)
-    return MapPlane(scenario.name, x, y, tuple(panels))
+        panels.append(MapPanel(title, settings, runs.counts, runs.compute_exponents()))
+    return MapPlane(scenario.name, x, y, tuple(panels), refused=refused)
 
 
-def _collect_runs(
-    rows: Sequence[Mapping[str, Any]], x: PlaneAxis, y: PlaneAxis
-) -> tuple[RunCounts, Array]:
+class _PanelRuns:
     """Counts the runs of a panel by grid point and class, and averages their growth exponents.
 
     Args:
-        rows: Runs of the panel, as for `build_plane`.
         x: Horizontal axis.
         y: Vertical axis. Its key is empty if only one axis is drawn.
 
-    Returns:
-        The fields `counts` and `exponents_per_s` of `MapPanel`.
+    Attributes:
+        counts: See `MapPanel`.
     """
-    shape = (len(y.values), len(x.values))
-    counts_shape = (*shape, len(CELL_CLASSES))
-    counts: RunCounts = np.zeros(counts_shape, dtype=np.int64)
-    exponents_per_s: Array = np.zeros(shape)
-    column_of_x = {value: column for column, value in enumerate(x.values)}
-    row_of_y = {value: row for row, value in enumerate(y.values)}
-    index_of_class = {verdict.value: index for index, verdict in enumerate(CELL_CLASSES)}
 
-    for run in rows:
-        i = row_of_y[run[y.key]] if y.key else 0
-        j = column_of_x[run[x.key]]
-        class_index = index_of_class[run["verdict"]]
-        counts[i, j, class_index] += 1
+    def __init__(self, x: PlaneAxis, y: PlaneAxis) -> None:
+        self._x_key = x.key
+        self._y_key = y.key
+        self._column_of_x = {value: column for column, value in enumerate(x.values)}
+        self._row_of_y = {value: row for row, value in enumerate(y.values)}
+        shape = (len(y.values), len(x.values))
+        self._sums_per_s: Array = np.zeros(shape)
+        self.counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
+
+    def add(self, run: Mapping[str, Any]) -> None:
+        """Counts a run.
+
+        Args:
+            run: A row for `build_plane`.
+        """
+        i = self._row_of_y[run[self._y_key]] if self._y_key else 0
+        j = self._column_of_x[run[self._x_key]]
+        self.counts[i, j, _CLASS_INDEX[run["verdict"]]] += 1
         exponent = run.get("exponent_per_s")
         # A run without an exponent makes the mean of its grid point NaN.
-        exponents_per_s[i, j] += np.nan if exponent is None else exponent
+        self._sums_per_s[i, j] += np.nan if exponent is None else exponent
 
-    runs = counts.sum(axis=2)
-    exponents_per_s /= np.maximum(runs, 1)
-    exponents_per_s[runs == 0] = np.nan
-    return counts, exponents_per_s
+    def compute_exponents(self) -> Array:
+        """Returns the mean growth exponent of each grid point, see `MapPanel`."""
+        runs = self.counts.sum(axis=2)
+        exponents_per_s: Array = self._sums_per_s / np.maximum(runs, 1)
+        exponents_per_s[runs == 0] = np.nan
+        return exponents_per_s
+
+
+_CLASS_INDEX = {verdict.value: index for index, verdict in enumerate(CELL_CLASSES)}
 
 
 def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
@@ -918,22 +978,28 @@ _ABOUT_TWINS = (
 """Explanation of this line on the page of the map."""
 
 
-def _trace_zero_exponent(panel: MapPanel) -> MapLine | None:
+ZERO_RATE = "growth rate = 0"
+"""Name of the line of zero growth rates of a sweep that is judged linearly."""
+
+
+def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
     """Finds the measured line on a map on which small disturbances neither grow nor die away.
 
     On this line, the growth exponent is zero. The exponent is the rate, in 1/s, at which a
     small disturbance grows.
 
     Args:
-        panel: Part of the map with the measured exponent at each grid point.
+        plane: The map.
+        panel: Part of the map with the exponent at each grid point.
 
     Returns:
         The line. None if it does not cross this part of the map.
     """
+    name = ZERO_RATE if plane.is_linear else ZERO_EXPONENT
     line = MapLine(
-        label=ZERO_EXPONENT,
-        text=ZERO_EXPONENT,
-        about=_ABOUT_TWINS,
+        label=name,
+        text=name,
+        about=_ABOUT_ROOTS if plane.is_linear else _ABOUT_TWINS,
         excess=-panel.exponents_per_s,
         rank=-1,
     )
@@ -1164,6 +1230,7 @@ def build_stability_map(
     *,
     linearly: bool = True,
     on: Workers = None,
+    simulated: SweepResults | None = None,
 ) -> StabilityMap:
     """Builds the stability map of a sweep: the results of its runs, and limits from theory.
 
@@ -1178,18 +1245,19 @@ def build_stability_map(
         linearly: True to add the line on which the linearised loop becomes unstable. This line
             takes most of the time.
         on: Workers that compute the linear analysis. None starts processes on this computer.
+        simulated: Another sweep over the same axes, whose measured limits are drawn as well.
 
     Returns:
         The map.
 
     Raises:
-        UsageError: There is nothing to draw, or there would be too many panels.
+        UsageError: There is nothing to draw, there would be too many panels, or the other sweep
+            has other axes.
     """
     plan = results.plan
-    keys = [axis.key for axis in plan.axes]
-    if len(plan.laws) > 1:
-        keys.insert(0, LAW_AXIS)
-    plane = build_plane(results.rows, keys, plan.base)
+    plane = _build_plane_of_sweep(results)
+    if simulated is not None:
+        plane = _add_simulated_edges(plane, _build_plane_of_sweep(simulated))
     stability_map = StabilityMap(
         plane=plane,
         lines=((),) * len(plane.panels),
@@ -1198,8 +1266,8 @@ def build_stability_map(
         title=plan.base.title or plan.base.name,
         fixed=tuple(describe_fixed_gains(plan)),
     )
-    x = plane.x
-    y = plane.y
+    x = thin_axis(plane.x, plan.refine)
+    y = thin_axis(plane.y, plan.refine)
     if not y.key or len(y.values) < 2:
         return stability_map
 
@@ -1207,13 +1275,14 @@ def build_stability_map(
     fine = _choose_columns(loaders, x, y)
     panel_lines = []
     for panel, load in zip(plane.panels, loaders, strict=True):
-        measured_line = _trace_zero_exponent(panel)
+        measured_line = _trace_zero_exponent(plane, panel)
         closed_form_line = trace_closed_form(load, x._replace(values=fine.values), y)
         if closed_form_line is not None:
             closed_form_line = closed_form_line.thin_out(fine)
         panel_lines.append([measured_line, closed_form_line])
     remarks = list[str]()
-    if linearly:
+    # The cells of a sweep that is judged linearly have the growth rates already.
+    if linearly and not plane.is_linear:
         tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
         with open_worker_pool(jobs, on, most=len(tasks)) as pool:
             columns = iter(pool.map(_analyse_column, tasks, progress))
@@ -1224,9 +1293,98 @@ def build_stability_map(
             lines.append(None if line is None else line.thin_out(fine))
             remarks += line_remarks
 
+    if plan.refine:
+        panel_lines = [
+            [lines[0], *(_spread_line(line, x, y, fine, plane) for line in lines[1:])]
+            for lines in panel_lines
+        ]
     crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
     distinct_remarks = tuple(dict.fromkeys(remarks))
     return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
+
+
+def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
+    """Arranges the runs of a sweep, with the values of its axes that its plan has.
+
+    Args:
+        results: The sweep.
+    """
+    plan = results.plan
+    grid: dict[str, Sequence[Any]] = {}
+    if len(plan.laws) > 1:
+        grid[LAW_AXIS] = list(plan.laws)
+    for axis in plan.axes:
+        grid[axis.key] = [axis.value(n) for n in range(len(axis.texts))]
+    plane = build_plane(results.rows, list(grid), plan.base, grid)
+    return plane._replace(halvings=plan.refine, is_linear=plan.judge == "linear")
+
+
+def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
+    """Returns a map with the measured limits of stability of another sweep.
+
+    Args:
+        plane: The map.
+        simulated: Map of the other sweep. Its axes may have other values.
+
+    Raises:
+        UsageError: The other map has other axes or panels.
+    """
+    edges_of = {
+        panel.settings: tuple(find_map_edges(simulated, panel)) for panel in simulated.panels
+    }
+    has_panels = all(panel.settings in edges_of for panel in plane.panels)
+    if (plane.x.key, plane.y.key) != (simulated.x.key, simulated.y.key) or not has_panels:
+        raise UsageError(
+            f"the other sweep has the axes {simulated.x.key}, {simulated.y.key}: a map shows "
+            f"its edge only over the same axes, {plane.x.key}, {plane.y.key}"
+        )
+    panels = [panel._replace(simulated=edges_of[panel.settings]) for panel in plane.panels]
+    return plane._replace(panels=tuple(panels))
+
+
+def thin_axis(axis: PlaneAxis, halvings: int) -> PlaneAxis:
+    """Returns the coarse part of an axis, with which a refined sweep begins.
+
+    Args:
+        axis: The axis.
+        halvings: Number of halvings of the refined sweep. 0 returns the whole axis.
+    """
+    last = len(axis.values) - 1
+    indices = sorted({*range(0, last, 1 << halvings), last})
+    return axis._replace(values=tuple(axis.values[n] for n in indices))
+
+
+def _spread_line(
+    line: MapLine | None, x: PlaneAxis, y: PlaneAxis, fine: _FineColumns, plane: MapPlane
+) -> MapLine | None:
+    """Interpolates the quantity of a line from a coarse grid to the grid points of a map.
+
+    Lines of theory are smooth, and the limit in each column of the coarse grid is exact.
+
+    Args:
+        line: The line over the coarse grid.
+        x: Horizontal axis of the coarse grid.
+        y: Vertical axis of the coarse grid.
+        fine: Columns at which the line was computed.
+        plane: The map.
+    """
+    if line is None:
+        return None
+
+    def spread_rows(excess: Array) -> Array:
+        columns = [np.interp(plane.y.values, y.values, column) for column in excess.T]
+        return np.array(columns).T
+
+    at_columns = spread_rows(line.excess)
+    excess = np.array([np.interp(plane.x.values, x.values, row) for row in at_columns])
+    drawn = spread_rows(line.drawn_excess)
+    values = np.array(fine.values)
+    positions = values
+    if not plane.x.is_evenly_spaced:
+        positions = np.interp(values, plane.x.values, plane.x.positions)
+    return line._replace(
+        excess=excess, fine_positions=tuple(positions.tolist()), fine_excess=drawn
+    )
 
 
 def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) -> _FineColumns:

@@ -24,6 +24,7 @@ import msgspec
 from trilat_net.analysis.judge import judge_virtual_run
 from trilat_net.analysis.run_end import EndBehaviour, RunTrace, Stability, classify_run_end
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
+from trilat_net.analysis.theory.linear_edge import compute_growth_column
 from trilat_net.analysis.theory.loop_roots import find_run_roots
 from trilat_net.analysis.twins.twin_growth import measure_virtual_twins
 from trilat_net.execution.fused import FusedRun, RunTotals, check_fusable
@@ -45,16 +46,22 @@ class CellClass(StrEnum):
     BOUNDED = "bounded oscillation"
     DIVERGED = "diverged"
     UNDECIDED = "undecided"
+    REFUSED = "refused"
 
     @property
     def stable(self) -> bool | None:
-        """True if a run of this class counts as stable, False if not, None if it is undecided.
+        """True if a run of this class counts as stable, False if not, None if it is not known.
 
-        Only converged runs count as stable.
+        Only converged runs count as stable. Nothing is known of runs that are undecided, and of
+        cells that are refused because they are not valid scenarios.
         """
-        if self is CellClass.UNDECIDED:
+        if self in (CellClass.UNDECIDED, CellClass.REFUSED):
             return None
         return self is CellClass.CONVERGED
+
+
+RUN_CLASSES = tuple(verdict for verdict in CellClass if verdict is not CellClass.REFUSED)
+"""Classes of a cell that ran. A refused cell is not a valid scenario."""
 
 
 def classify_decision(stability: Stability, behaviour: EndBehaviour) -> CellClass:
@@ -85,7 +92,9 @@ class CellResult(msgspec.Struct, frozen=True):
     Attributes:
         verdict: Class of the cell.
         motion: Behaviour at the end, as in the stability certificate. It distinguishes growth
-            from divergence, and decay from convergence.
+            from divergence, and decay from convergence. None without a run: the cell is not a
+            valid scenario, or was judged by its linear loop. The numbers of its run are then
+            None as well.
         ran_s: Duration of the run, in s, including extensions. It is shorter than planned if an
             arm left its limits.
         extended: Number of times that the duration was doubled.
@@ -104,10 +113,10 @@ class CellResult(msgspec.Struct, frozen=True):
         effort_nm: See `RunTotals`.
         force_peak_n: See `RunTotals`.
         walls_j: See `RunTotals`.
-        reasons: Reasons why the run is undecided, as a string.
+        reasons: Reasons why the run is undecided, or its cell refused, as a string.
         exponent_per_s: Growth exponent over the scenario's duration, from twins (repetitions
             with a small push), in 1/s, see `measure_exponent`. None without twins, or if no
-            twin moved.
+            twin moved. In a sweep that is judged linearly, the real part of the rightmost root.
         stability: The decision whether the run is stable, as in the stability certificate.
             Empty in results of older versions.
         rests_on: What the decision rests on, for example exact roots. Empty in results of older
@@ -115,14 +124,14 @@ class CellResult(msgspec.Struct, frozen=True):
     """
 
     verdict: CellClass
-    motion: EndBehaviour
+    motion: EndBehaviour | None
     ran_s: float
     extended: int
-    end_error_rad: float
-    end_speed_rad_s: float
+    end_error_rad: float | None
+    end_speed_rad_s: float | None
     error_rate_per_s: float | None
     speed_rate_per_s: float | None
-    peak_error_rad: float
+    peak_error_rad: float | None
     settled_s: float | None
     diverged_s: float | None
     rms_error_rad: float | None = None
@@ -133,6 +142,29 @@ class CellResult(msgspec.Struct, frozen=True):
     exponent_per_s: float | None = None
     stability: str = ""
     rests_on: str = ""
+
+
+def build_unsimulated_result(verdict: CellClass, reasons: str) -> CellResult:
+    """Returns the result of a cell without a run.
+
+    Args:
+        verdict: Class of the cell.
+        reasons: Why the cell is refused or undecided. Empty if the cell is decided.
+    """
+    return CellResult(
+        verdict=verdict,
+        motion=None,
+        ran_s=0.0,
+        extended=0,
+        end_error_rad=None,
+        end_speed_rad_s=None,
+        error_rate_per_s=None,
+        speed_rate_per_s=None,
+        peak_error_rad=None,
+        settled_s=None,
+        diverged_s=None,
+        reasons=reasons,
+    )
 
 
 TWINS_OF_A_CELL = 4
@@ -343,6 +375,31 @@ def measure_exponent(scenario: Scenario) -> float | None:
     twins = measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
+
+
+def judge_linearly(scenario: Scenario) -> CellResult:
+    """Classifies a cell by the rightmost characteristic root of its linear loop, without a run.
+
+    The cell is undecided if the scenario has no linear loop, or if nothing moves.
+
+    Args:
+        scenario: Scenario of the cell.
+    """
+    column = compute_growth_column([scenario], "", [0.0], at_mean_pose=True)
+    (rate_per_s,) = column.growth_per_s
+    remarks = "; ".join(column.remarks)
+    if math.isnan(rate_per_s):
+        return build_unsimulated_result(CellClass.UNDECIDED, remarks)
+    if math.isinf(rate_per_s):
+        return build_unsimulated_result(CellClass.UNDECIDED, "nothing moves in the linear loop")
+    verdict = CellClass.DIVERGED if rate_per_s > 0.0 else CellClass.CONVERGED
+    basis = "Floquet multipliers" if column.is_sampled else "characteristic roots"
+    reasons = [f"{basis} of the linear loop", *column.remarks]
+    return msgspec.structs.replace(
+        build_unsimulated_result(verdict, ""),
+        exponent_per_s=rate_per_s,
+        rests_on="; ".join(reasons),
+    )
 
 
 def _chatters(scenario: Scenario, run: FusedRun) -> bool:

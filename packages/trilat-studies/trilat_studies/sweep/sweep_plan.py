@@ -304,9 +304,10 @@ MAX_EXTENSION = 8.0
 """
 MAX_SCENARIO_S = 86_400.0
 """Longest duration that a scenario may have, in s."""
-JUDGES = ("verdict", "twins")
-"""Ways to judge a run. "verdict" classifies the end of the run. "twins" repeats the run with a
-small push and measures the growth exponent, the rate at which the disturbance grows.
+JUDGES = ("verdict", "twins", "linear")
+"""Ways to judge a cell. "verdict" classifies the end of its run. "twins" repeats the run with a
+small push and measures the growth exponent, the rate at which the disturbance grows. "linear"
+computes the characteristic roots of the linear loop, without a run.
 """
 _CHECKED_VALUES = 32
 """Largest number of values of an axis that are checked before the first run."""
@@ -351,6 +352,8 @@ class SweepPlan(NamedTuple):
             small push.
         metrics: Keys of further metrics from `docs/reference/metrics.md` that are measured in
             each run.
+        refine: Number of times that the boxes along the stability edge are halved, see
+            `edge_refinement`. 0 runs all cells.
     """
 
     written: ExperimentText
@@ -362,16 +365,17 @@ class SweepPlan(NamedTuple):
     longest_s: float
     judge: str = "verdict"
     metrics: tuple[str, ...] = ()
+    refine: int = 0
 
     @property
     def default_longest_s(self) -> float:
         """Default of the longest duration to which an undecided run is extended, in s.
 
         It is the duration of the scenario times `MAX_EXTENSION`, but at most `MAX_SCENARIO_S`.
-        If runs are judged by how fast small disturbances grow, they are never extended, so it
+        If cells are judged by how fast small disturbances grow, runs are never extended, so it
         is the duration of the scenario.
         """
-        extension = 1.0 if self.judge == "twins" else MAX_EXTENSION
+        extension = MAX_EXTENSION if self.judge == "verdict" else 1.0
         return min(MAX_SCENARIO_S, extension * self.base.duration_s)
 
     @property
@@ -435,9 +439,10 @@ class SweepPlan(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """Returns the plan of the sweep as plain values for a JSON file.
 
-        `plan_from_json` restores the plan from them. The keys "judge" (how runs are judged) and
-        "metrics" (which further metrics are measured) are left out if they have their defaults,
-        so that plans of older versions give the same file.
+        `plan_from_json` restores the plan from them. The keys "judge" (how runs are judged),
+        "metrics" (which further metrics are measured) and "refine" (how often the edge is
+        refined) are left out if they have their defaults, so that plans of older versions give
+        the same file.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -455,6 +460,8 @@ class SweepPlan(NamedTuple):
             plan["judge"] = self.judge
         if self.metrics:
             plan["metrics"] = list(self.metrics)
+        if self.refine:
+            plan["refine"] = self.refine
         return plan
 
 
@@ -468,6 +475,7 @@ def plan_sweep(
     longest_s: float | None = None,
     judge: str = "verdict",
     metrics: Sequence[str] = (),
+    refine: int = 0,
 ) -> SweepPlan:
     """Plans a sweep, which runs a scenario with many parameters, and checks that it can run.
 
@@ -516,7 +524,13 @@ def plan_sweep(
         longest_s=0.0,  # set below, because the default depends on the plan
         judge=judge,
         metrics=_list_metrics(metrics),
+        refine=refine,
     )
+    _check_refinement(plan)
+    if judge == "linear" and plan.metrics:
+        raise UsageError(
+            "metrics need a run, and --judge linear makes none: leave out one of them"
+        )
     if longest_s is None:
         longest_s = plan.default_longest_s
     elif not base.duration_s <= longest_s <= MAX_SCENARIO_S:
@@ -559,7 +573,46 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
         longest_s=facts["longest_s"],
         judge=facts.get("judge", "verdict"),
         metrics=tuple(facts.get("metrics", ())),
+        refine=facts.get("refine", 0),
     )
+
+
+MOST_HALVINGS = 16
+"""Largest number of times that the boxes along the stability edge are halved."""
+MOST_REFINED_CELLS = 100_000_000
+"""Largest number of cells of a grid that is refined, which takes 4 bytes for each."""
+_REFINED_AXES = 2
+"""Largest number of axes that are refined, which are those of a map."""
+
+
+def list_refined_axes(axes: Sequence[_SweepAxis]) -> list[int]:
+    """Returns the indices of the axes that a refined sweep halves: the first two numeric ones.
+
+    Args:
+        axes: All axes of the sweep.
+    """
+    numeric = [n for n, axis in enumerate(axes) if axis.numeric and len(axis.texts) > 1]
+    return numeric[:_REFINED_AXES]
+
+
+def _check_refinement(plan: SweepPlan) -> None:
+    """Checks that a sweep can be refined as often as its plan states.
+
+    Raises:
+        UsageError: The number is out of range, no axis can be refined, or the grid is too
+            large.
+    """
+    if not 0 <= plan.refine <= MOST_HALVINGS:
+        raise UsageError(f"--refine must be from 0 to {MOST_HALVINGS}, not {plan.refine}")
+    if plan.refine and not list_refined_axes(plan.axes):
+        raise UsageError(
+            "--refine needs an axis with several numbers, as in --over KEY=a:b:step"
+        )
+    if plan.refine and plan.cells > MOST_REFINED_CELLS:
+        raise UsageError(
+            f"--refine takes a grid of at most {MOST_REFINED_CELLS:.0e} cells, not "
+            f"{plan.cells:.3g}: use larger steps"
+        )
 
 
 def _list_metrics(names: Sequence[str]) -> tuple[str, ...]:
@@ -710,22 +763,32 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
 
     Checking all cells of a large grid would take too long. The sample has up to
     `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their first
-    values, and the corners of the grid.
+    values, and the corners of the grid. A single combination that is not valid is allowed: the
+    sweep refuses this cell alone.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
         law_index: Index of the law.
 
     Raises:
-        ScenarioError: A cell cannot run, or two values of an axis give the same scenario.
+        ScenarioError: A value cannot run with the first nor with the last values of the other
+            axes, no corner can run, or two values of an axis give the same scenario.
     """
     first_cell = [law_index] + [0] * len(plan.axes)
+    last_cell = [law_index, *(len(axis.texts) - 1 for axis in plan.axes)]
     for dimension, axis in enumerate(plan.axes, 1):
         value_of_digest: dict[str, str] = {}
-        for index in _spread_indices(len(axis.texts)):
+        for index in spread_indices(len(axis.texts)):
             indices = first_cell.copy()
             indices[dimension] = index
-            digest = _load_cell(plan, indices).sha256
+            try:
+                digest = _load_cell(plan, indices).sha256
+            except ScenarioError as error:
+                others = last_cell.copy()
+                others[dimension] = index
+                if not _is_valid(plan, others):
+                    raise error from None
+                continue
             text = axis.texts[index]
             if digest in value_of_digest:
                 raise ScenarioError(
@@ -738,11 +801,26 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
             value_of_digest[digest] = text
 
     axis_ends = [sorted({0, len(axis.texts) - 1}) for axis in plan.axes]
-    for corner in product([law_index], *axis_ends):
-        _load_cell(plan, corner)
+    corners = list(product([law_index], *axis_ends))
+    if not any(_is_valid(plan, corner) for corner in corners):
+        _load_cell(plan, corners[0])
 
 
-def _spread_indices(count: int) -> list[int]:
+def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
+    """Returns True if a cell is a valid scenario.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        indices: Index of the law and of the value on each axis.
+    """
+    try:
+        _load_cell(plan, indices)
+    except ScenarioError:
+        return False
+    return True
+
+
+def spread_indices(count: int) -> list[int]:
     """Returns the indices of the values that are checked before a sweep, at most a few.
 
     They are evenly spread over `count` values, and include the first and the last one. A grid
@@ -898,6 +976,8 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
         arguments += ["--law", ",".join(plan.laws)]
     if plan.judge != "verdict":
         arguments += ["--judge", plan.judge]
+    if plan.refine:
+        arguments += ["--refine", str(plan.refine)]
     for key in plan.metrics:
         arguments += ["--metric", key]
     if plan.longest_s != plan.default_longest_s:

@@ -18,11 +18,12 @@ Invariant:
       which the scenario of the row was written.
 """
 
-import csv
 import json
+import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,23 +36,24 @@ from trilat_net.files import write_whole
 from trilat_net.results import Result
 from trilat_net.scenario.scenario_reader import read_source
 from trilat_net.work.intervals import MeanInterval, mean_interval, wilson_interval
-from trilat_net.work.study_folder import encode_csv, format_command, set_options
+from trilat_net.work.study_folder import format_command, set_options
 
-from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
+from .result_table import (
+    ResultRow,
+    ResultTable,
+    StoredRows,
+    format_table_cell,
+    iterate_csv,
+    list_axis_columns,
+    read_rows,
+)
+from .sweep_cell import RUN_CLASSES, CellClass, CellResult, CellRun, apply_diff
 from .sweep_plan import SweepPlan, plan_from_json
 
 RESULTS_FILE = "results.csv"
 """Name of the table of runs in the folder of a sweep."""
 PLAN_FILE = "plan.json"
 """Name of the file with the plan of the sweep, which is needed to read `results.csv`."""
-
-
-ResultRow = Mapping[str, Any]
-"""One run, as a mapping with these keys: `cell`, the value of each axis under the key of the
-axis, `law`, `seed`, `random`, the further metrics under their keys, all fields of `CellResult`,
-`scenario_sha256`, `command` and `scenario`. The classes of the run are texts. `scenario` is the
-canonical text of the scenario that was run.
-"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,7 +65,8 @@ class SweepResults(Result):
 
     Attributes:
         plan: The sweep: its scenario, axes, control laws and seeds.
-        rows: One row per run, ordered by cell and then by seed.
+        rows: One row per run, ordered by cell and then by seed. The rows of a large sweep stay
+            in the file of the table, and are read when they are needed.
     """
 
     plan: SweepPlan
@@ -105,6 +108,8 @@ class SweepResults(Result):
             UsageError: The sweep has no cell with this number.
         """
         self.plan.cell(number)
+        if isinstance(self.rows, StoredRows):
+            return self.rows.find_cell(number)
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
@@ -129,24 +134,37 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
     Returns:
         One row per run, ordered by cell and then by seed.
     """
-    seed_rank = {seed: index for index, seed in enumerate(plan.seeds)}
-    runs_of_cell = Counter(entry.cell for entry in entries)
+    done = {(entry.cell, entry.seed): entry for entry in entries}
+    return [row for runs in iterate_cells(plan, done) for row in build_cell_rows(plan, runs)]
 
-    def rank(entry: CellRun) -> tuple[int, int]:
-        """Returns the sort key of a run: its cell, then the position of its seed in the plan.
 
-        Worker processes finish in any order, and the table must not depend on it.
-        """
-        return entry.cell, seed_rank[entry.seed]
+def iterate_cells(
+    plan: SweepPlan, done: Mapping[tuple[int, int], CellRun]
+) -> Iterator[list[CellRun]]:
+    """Yields the finished runs of each cell, ordered by cell and then by seed.
 
-    rows: list[ResultRow] = []
-    for entry in sorted(entries, key=rank):
+    Worker processes finish in any order, and the results must not depend on it.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        done: The finished runs, by cell and seed.
+    """
+    cells = {cell for cell, _ in done} if len(plan.seeds) > 1 else (cell for cell, _ in done)
+    for cell in sorted(cells):
+        yield [done[cell, seed] for seed in plan.seeds if (cell, seed) in done]
+
+
+def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
+    """Yields the rows of the runs of one cell.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        runs: All finished runs of the cell.
+    """
+    for entry in runs:
         # The log of a cell with a single run needs no seed in its name.
-        has_several_runs = runs_of_cell[entry.cell] > 1
-        suffix = f"-seed-{entry.seed}" if has_several_runs else ""
-        log = f"cell-{entry.cell}{suffix}.mcap"
-        rows.append(_build_row(plan, entry, log))
-    return rows
+        suffix = f"-seed-{entry.seed}" if len(runs) > 1 else ""
+        yield _build_row(plan, entry, f"cell-{entry.cell}{suffix}.mcap")
 
 
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
@@ -224,17 +242,6 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     return max(outcome.ran_s, planned_s)
 
 
-_SCENARIO_COLUMN = "scenario_changes"
-"""Column of the CSV table with the scenario of the row. To save space it contains only the
-differences from the swept scenario, as JSON.
-"""
-
-_LONGEST_CELL = 2**26
-"""Largest number of characters in a cell of the CSV table. A scenario that contains a delay
-trace exceeds the default limit of the csv module, 131 072 characters.
-"""
-
-
 def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
     """Returns the results as CSV text, with one line per run.
 
@@ -242,77 +249,7 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
         plan: The sweep: its scenario, axes, control laws and seeds.
         rows: The runs, one mapping from columns to values per run.
     """
-    column_types = _list_result_columns(plan)
-    lines = []
-    for row in rows:
-        line = {}
-        for name, kind in column_types.items():
-            value = row[name]
-            line[name] = _format_cell(value, kind)
-        changes = diff_lines(row["scenario"], plan.base.text)
-        line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
-        lines.append(line)
-    return encode_csv(lines, [*column_types, _SCENARIO_COLUMN])
-
-
-def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns of the CSV table in their order, each with the type of its values.
-
-    The column with the scenario is not listed, because it needs special treatment.
-    """
-    column_types = {**_list_axis_columns(plan), "seed": int, "random": bool}
-    # All fields of a result are numbers, except those whose types are corrected below.
-    number_columns = (*plan.metrics, *CellResult.__struct_fields__)
-    column_types |= dict.fromkeys(number_columns, float)
-    text_columns = ("verdict", "motion", "reasons", "stability", "rests_on", "scenario_sha256")
-    column_types |= dict.fromkeys((*text_columns, "command"), str)
-    return column_types | {"extended": int}
-
-
-def _list_axis_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns that identify a cell, with their types: number, axes and law.
-
-    The types serve to read the CSV table again.
-    """
-    column_types: dict[str, type] = {"cell": int}
-    for axis in plan.axes:
-        column_types[axis.key] = float if axis.numeric else str
-    column_types["law"] = str
-    return column_types
-
-
-def _format_cell(value: Any, kind: type) -> str:
-    """Returns the text of a cell of the CSV table, from which numbers parse back bit for bit.
-
-    Args:
-        value: The value. None becomes an empty text.
-        kind: Type of the column.
-    """
-    if value is None:
-        return ""
-    if kind is bool:
-        return "true" if value else "false"
-    return repr(float(value)) if kind is float else str(value)
-
-
-def _parse_cell(text: str, kind: type) -> Any:
-    """Returns the value of a cell of the CSV table; the inverse of `_format_cell`.
-
-    Args:
-        text: Text of the cell.
-        kind: Type of the column.
-
-    Raises:
-        ValueError: The text is not a number although the column contains numbers.
-            It is neither "true" nor "false" although the column contains bools.
-    """
-    if kind is str:
-        return text
-    if kind is bool:
-        if text not in ("true", "false"):
-            raise ValueError(f"{text!r} is neither true nor false")
-        return text == "true"
-    return kind(text) if text else None
+    return "".join(ResultTable(plan).encode(rows))
 
 
 def read_results(path: Path) -> SweepResults:
@@ -340,46 +277,7 @@ def read_results(path: Path) -> SweepResults:
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
 
-    try:
-        lines = _read_lines(file)
-        rows = [_read_row(line, plan) for line in lines]
-    except KeyError as error:
-        raise UsageError(
-            f"{file}: contains no results of a sweep: the column {error} is missing"
-        ) from None
-    except (OSError, ValueError, TypeError, IndexError, csv.Error) as error:
-        raise UsageError(f"{file}: cannot be read as results of a sweep: {error}") from None
-    return SweepResults(plan, rows)
-
-
-def _read_lines(file: Path) -> list[dict[str, str]]:
-    """Reads the CSV table of a sweep, whose cells may hold the whole text of a scenario.
-
-    The limit of the csv module applies to the whole process. Therefore it is raised only here.
-    """
-    limit = csv.field_size_limit(_LONGEST_CELL)
-    try:
-        with file.open(encoding="utf-8", newline="") as stream:
-            return list(csv.DictReader(stream, strict=True))
-    finally:
-        csv.field_size_limit(limit)
-
-
-def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
-    """Returns the row of a line of the CSV table, with the complete text of its scenario.
-
-    Args:
-        line: Texts of the line, by column.
-        plan: The sweep: its scenario, axes, control laws and seeds.
-    """
-    row = {}
-    column_types = _list_result_columns(plan)
-    for name, kind in column_types.items():
-        text = line[name]
-        row[name] = _parse_cell(text, kind)
-    changes = json.loads(line[_SCENARIO_COLUMN])
-    row["scenario"] = apply_diff(changes, plan.base.text)
-    return row
+    return SweepResults(plan, read_rows(file, plan))
 
 
 GRID_POINTS_FILE = "places.csv"
@@ -394,7 +292,7 @@ class GridPoint(NamedTuple):
         law: Control laws of the sites.
         values: Value of the cell on each axis.
         counts: Number of runs of each class, such as converged or diverged, in the order of
-            `CellClass`.
+            `RUN_CLASSES`.
         means: Mean, with its 95 % interval, of each quantity of `list_totals`, over the runs
             that stayed within the limits of their arms. None for fewer than two such runs.
     """
@@ -408,13 +306,13 @@ class GridPoint(NamedTuple):
     @property
     def decided(self) -> int:
         """Number of runs that were judged stable or not stable. Undecided runs are left out."""
-        classes = zip(self.counts, CellClass, strict=True)
+        classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
         """Number of runs of the cell that were judged stable. It is at most `decided`."""
-        classes = zip(self.counts, CellClass, strict=True)
+        classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
     @property
@@ -458,15 +356,19 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
         has the number of runs with each result, and the means of the measured totals. The order
         is the order in which the combinations first occur in the results.
     """
-    rows_of_cell: dict[tuple[int, str], list[ResultRow]] = {}
-    for row in results.rows:
-        cell_and_law = (row["cell"], row["law"])
-        cell_rows = rows_of_cell.setdefault(cell_and_law, [])
-        cell_rows.append(row)
+    return list(iterate_grid_points(results))
 
-    points = []
+
+def iterate_grid_points(results: SweepResults) -> Iterator[GridPoint]:
+    """Yields the summary of each grid point, as `collect_grid_points` returns them.
+
+    Args:
+        results: Results of the sweep, in which the rows of a cell stand together.
+    """
     totals = list_totals(results.plan)
-    for (cell, law), rows in rows_of_cell.items():
+    groups = groupby(results.rows, key=lambda row: (row["cell"], row["law"]))
+    for (cell, law), group in groups:
+        rows = list(group)
         counts = Counter(row["verdict"] for row in rows)
         # The totals of a run that diverged describe a shorter time, so they are not averaged.
         rows_within_limits = [row for row in rows if row["diverged_s"] is None]
@@ -474,19 +376,17 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
         for key in totals:
             values = [row.get(key) for row in rows_within_limits]
             means.append(mean_interval(values))
-        class_counts = [counts[verdict.value] for verdict in CellClass]
-        point = GridPoint(
+        class_counts = [counts[verdict.value] for verdict in RUN_CLASSES]
+        yield GridPoint(
             cell=cell,
             law=law,
             values=results.plan.cell(cell).values,
             counts=tuple(class_counts),
             means=tuple(means),
         )
-        points.append(point)
-    return points
 
 
-def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
+def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator[str]:
     """Encodes grid points as a CSV table, with one line per point.
 
     A line contains the number of the cell, its axis values and law, the number of runs of each
@@ -496,17 +396,20 @@ def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
         points: The grid points, in the order of the lines.
+
+    Yields:
+        The header, and the text of each line.
     """
-    column_types = _list_axis_columns(plan)
+    column_types = list_axis_columns(plan)
     column_types["runs"] = int
-    column_types |= {verdict.value: int for verdict in CellClass}
+    column_types |= {verdict.value: int for verdict in RUN_CLASSES}
     share_columns = ("stable_share", "stable_share_low", "stable_share_high")
     column_types |= dict.fromkeys(share_columns, float)
     for key in list_totals(plan):
         column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
 
-    lines = []
-    for point in points:
+    def format_point(point: GridPoint) -> dict[str, str]:
+        """Returns the texts of the line of a point, by column."""
         decided = point.decided
         stable_share = point.stable / decided if decided else None
         # The values must stand in the order of the columns above.
@@ -517,9 +420,10 @@ def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
             values += mean or (None, None)
         line = {}
         for (name, kind), value in zip(column_types.items(), values, strict=True):
-            line[name] = _format_cell(value, kind)
-        lines.append(line)
-    return encode_csv(lines, list(column_types))
+            line[name] = format_table_cell(value, kind)
+        return line
+
+    yield from iterate_csv(map(format_point, points), list(column_types))
 
 
 _TOTALS = {
@@ -531,8 +435,9 @@ _TOTALS = {
 """Quantities whose range over the runs is printed: the key, the name and the unit."""
 
 
-_MAX_DOUBTFUL_SHOWN = 8
-"""Largest number of doubtful grid points in the summary. The CSV file has all of them."""
+_MAX_CELLS_SHOWN = 8
+"""Largest number of doubtful or refused cells in the summary. The CSV files have all of them.
+"""
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
@@ -564,6 +469,12 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
     extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
+    if plan.refine:
+        steps = count_nouns(1 << plan.refine, "cell")
+        times = count_nouns(plan.refine, "time")
+        lines.append(f"  steps of {steps}, halved {times} along the stability edge")
+    if plan.judge == "linear":
+        return [*lines, "  judged by the roots of the linear loop, without runs"]
     twins = ", judged by twins" if plan.judge == "twins" else ""
     return [*lines, f"  {first_s:g} s each{extended}{twins}"]
 
@@ -578,88 +489,165 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     Args:
         results: Results of the sweep: its plan and one row per run.
     """
-    rows = results.rows
-    counts = Counter(row["verdict"] for row in rows)
-    verdict_texts = [f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass]
-    verdicts = ", ".join(verdict_texts)
-    runs = count_nouns(len(rows), "run")
-    cells = count_nouns(results.plan.cells, "cell")
-    yield f"{runs} of {cells}: {verdicts}"
+    plan = results.plan
+    tally = _tally_rows(results)
+    verdict_texts = []
+    for verdict in CellClass:
+        count = tally.counts[verdict.value]
+        if count or verdict is not CellClass.REFUSED:
+            verdict_texts.append(f"{count} {verdict.value}")
+    runs = count_nouns(len(results.rows), "run")
+    cells = count_nouns(plan.cells, "cell")
+    yield f"{runs} of {cells}: {', '.join(verdict_texts)}"
+    yield from tally.refusals
 
-    extended = [row for row in rows if row["extended"]]
-    if extended:
-        longest_s = max(row["ran_s"] for row in extended)
-        first_s = results.plan.base.duration_s
+    if tally.extended:
+        first_s = plan.base.duration_s
         yield (
-            f"{len(extended)} were undecided after {first_s:g} s and continued, the longest to "
-            f"{longest_s:g} s"
+            f"{tally.extended} were undecided after {first_s:g} s and continued, the longest "
+            f"to {tally.longest_s:g} s"
         )
 
-    within_limits = [row for row in rows if row["diverged_s"] is None]
-    ranges = _list_ranges(results.plan, within_limits)
+    ranges = []
+    for key, (name, unit) in _list_quantities(plan).items():
+        value_range = tally.ranges[key]
+        if value_range.count:
+            text = f"{name} {value_range.low:.3g} to {value_range.high:.3g} {unit}"
+            ranges.append(text.rstrip())
     if ranges:
-        yield f"within their limits {len(within_limits)}: {', '.join(ranges)}"
+        yield f"within their limits {tally.within_limits}: {', '.join(ranges)}"
 
-    rates = _list_values(rows, "exponent_per_s")
-    if rates:
-        growing = sum(rate > 0.0 for rate in rates)
-        interval = f"{min(rates):+.3g} to {max(rates):+.3g} /s"
-        yield f"growth exponents of small pushes {interval}: {growing} of {len(rates)} grow"
+    rates = tally.exponents
+    if rates.count:
+        interval = f"{rates.low:+.3g} to {rates.high:+.3g} /s"
+        is_linear = plan.judge == "linear"
+        name = "growth rates of the linear loop" if is_linear else GROWTH_EXPONENTS
+        yield f"{name} {interval}: {rates.positive} of {rates.count} grow"
 
-    if len(results.plan.seeds) > 1:
-        yield from _summarize_seeds(results)
+    if len(plan.seeds) > 1:
+        yield from _summarize_seeds(results, tally.not_random)
 
 
-def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
-    """Returns texts with the smallest and largest value of each quantity over some runs.
+GROWTH_EXPONENTS = "growth exponents of small pushes"
+"""Name of the quantity that twins measure."""
+
+
+def _list_quantities(plan: SweepPlan) -> dict[str, tuple[str, str]]:
+    """Returns the name and unit of each quantity whose range is printed, by its key.
 
     Args:
         plan: The sweep, whose requested metrics come first.
-        rows: The runs, one mapping from columns to values per run.
-
-    Returns:
-        Texts such as "RMS e 0.012 to 0.4 rad", without the quantities that no run has.
     """
     quantities = {}
     for metric in map(find_quantity, plan.metrics):
         quantities[metric.key] = (metric.name, metric.unit)
-    quantities |= _TOTALS
-    ranges = []
-    for key, (name, unit) in quantities.items():
-        values = _list_values(rows, key)
-        if values:
-            text = f"{name} {min(values):.3g} to {max(values):.3g} {unit}"
-            ranges.append(text.rstrip())
-    return ranges
+    return quantities | _TOTALS
 
 
-def _list_values(rows: Sequence[ResultRow], key: str) -> list[float]:
-    """Returns the numbers of one column of a table, without the rows that have none.
+class _ValueRange:
+    """Smallest and largest value of a quantity over the runs of a sweep.
+
+    Attributes:
+        count: Number of runs that have the quantity.
+        positive: Number of runs in which it is positive.
+        low: Smallest value.
+        high: Largest value.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.positive = 0
+        self.low = math.inf
+        self.high = -math.inf
+
+    def add(self, value: float | None) -> None:
+        """Counts the value of a run. None if the run lacks the quantity."""
+        if value is None:
+            return
+        self.count += 1
+        self.positive += value > 0.0
+        self.low = min(self.low, value)
+        self.high = max(self.high, value)
+
+
+class _RowTally:
+    """Numbers of the summary of a sweep, which are collected in one pass over its rows.
 
     Args:
-        rows: Rows of the table.
-        key: Name of the column.
+        quantities: Keys of the quantities whose ranges are printed.
+
+    Attributes:
+        counts: Number of runs of each class.
+        extended: Number of runs that were extended.
+        longest_s: Duration of the longest of these, in s.
+        within_limits: Number of runs whose arms stayed within their limits.
+        ranges: Range of each quantity over these runs.
+        exponents: Range of the growth exponents of all runs.
+        not_random: Number of runs in which nothing is random.
+        refusals: Lines on the first cells that are not valid scenarios.
     """
-    values = [row.get(key) for row in rows]
-    return [value for value in values if value is not None]
+
+    def __init__(self, quantities: Iterable[str]) -> None:
+        self.counts: Counter[str] = Counter()
+        self.extended = 0
+        self.longest_s = 0.0
+        self.within_limits = 0
+        self.ranges = {key: _ValueRange() for key in quantities}
+        self.exponents = _ValueRange()
+        self.not_random = 0
+        self.refusals: list[str] = []
 
 
-def _summarize_seeds(results: SweepResults) -> Iterator[str]:
+def _tally_rows(results: SweepResults) -> _RowTally:
+    """Collects the numbers of the summary of a sweep. Every row is read once.
+
+    Args:
+        results: Results of the sweep: its plan and one row per run.
+    """
+    tally = _RowTally(_list_quantities(results.plan))
+    for row in results.rows:
+        tally.counts[row["verdict"]] += 1
+        if row["verdict"] == CellClass.REFUSED:
+            if len(tally.refusals) < _MAX_CELLS_SHOWN:
+                tally.refusals.append(f"  {row['reasons']}")
+            continue
+        tally.not_random += not row["random"]
+        if row["extended"]:
+            tally.extended += 1
+            tally.longest_s = max(tally.longest_s, row["ran_s"])
+        if row["diverged_s"] is None:
+            tally.within_limits += 1
+            for key, value_range in tally.ranges.items():
+                value_range.add(row.get(key))
+        tally.exponents.add(row.get("exponent_per_s"))
+    return tally
+
+
+def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
     """Yields the lines of the summary that concern the seeds.
 
     The first line counts the cells in which nothing is random, which run only once. The others
     list the cells that are stable with some seeds and not stable with others.
+
+    Args:
+        results: Results of the sweep: its plan and one row per run.
+        not_random: Number of runs in which nothing is random.
     """
-    not_random = sum(not row["random"] for row in results.rows)
     if not_random:
         cells = count_nouns(not_random, "cell")
         yield f"in {cells} nothing is random: one seed was run there, for all"
 
-    doubtful = [point for point in collect_grid_points(results) if point.doubtful]
+    doubtful = []
+    doubtful_count = 0
+    for point in iterate_grid_points(results):
+        if point.doubtful:
+            doubtful_count += 1
+            if doubtful_count <= _MAX_CELLS_SHOWN:
+                doubtful.append(point)
     if doubtful:
-        cells = count_nouns(len(doubtful), "cell")
+        cells = count_nouns(doubtful_count, "cell")
         yield f"stable with some seeds and not with others, {cells}:"
-    for point in doubtful[:_MAX_DOUBTFUL_SHOWN]:
+    for point in doubtful:
         setting = [point.law] if results.plan.laws else []
         for axis, value in zip(results.plan.axes, point.values, strict=True):
             setting.append(f"{axis.key} {value}")
@@ -669,8 +657,8 @@ def _summarize_seeds(results: SweepResults) -> Iterator[str]:
             f"{point.stable} of {point.decided} stable, "
             f"95 % interval {low:.0f} to {high:.0f} %"
         )
-    if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
-        hidden = len(doubtful) - _MAX_DOUBTFUL_SHOWN
+    if doubtful_count > _MAX_CELLS_SHOWN:
+        hidden = doubtful_count - _MAX_CELLS_SHOWN
         yield f"  and {hidden} more, all in {GRID_POINTS_FILE}"
 
 

@@ -18,6 +18,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,8 @@ import msgspec
 from trilat_net.analysis.metrics.log_metrics import measure_run
 from trilat_net.errors import (
     CodeFailed,
+    CodeWithheld,
+    LogRefused,
     ScenarioError,
     UsageError,
     count_nouns,
@@ -48,17 +51,20 @@ from trilat_net.work.study_folder import (
 from trilat_net.workers import count_cores
 
 from . import sweep_cell
-from .sweep_cell import CellResult, CellRun
+from .cell_groups import find_cell_groups
+from .edge_refinement import NOT_KNOWN, EdgeRefinement, choose_side
+from .result_table import ResultRow, ResultTable, read_rows
+from .sweep_cell import CellClass, CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json
 from .sweep_results import (
     GRID_POINTS_FILE,
     PLAN_FILE,
     RESULTS_FILE,
     SweepResults,
-    build_result_rows,
-    collect_grid_points,
+    build_cell_rows,
     encode_grid_points,
-    encode_results,
+    iterate_cells,
+    iterate_grid_points,
 )
 
 JOURNAL_FILE = "cells.journal"
@@ -73,6 +79,7 @@ _DIFFERENCES = {
     "longest_s": "another longest time",
     "judge": "another judge",
     "metrics": "other metrics",
+    "refine": "another refinement",
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
@@ -156,11 +163,11 @@ def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
 
     Args:
         key: Key of the property in the plan, one of `_DIFFERENCES`. A plan without the key has
-            its default: the first judge, or an empty list.
+            its default: the first judge, no refinement, or an empty list.
         facts: The plan as plain values.
     """
-    default: Any = JUDGES[0] if key == "judge" else []
-    value = facts.get(key, default)
+    defaults: dict[str, Any] = {"judge": JUDGES[0], "refine": 0}
+    value = facts.get(key, defaults.get(key, []))
 
     # The text of a scenario is too long for a message. Its name and hash identify it.
     if key in ("text", "scenario_sha256"):
@@ -206,8 +213,8 @@ def _read_facts(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
-    # A plan with the default judge and without metrics does not store these keys.
-    optional = {"judge", "metrics"}
+    # A plan does not store these keys if they have their defaults.
+    optional = {"judge", "metrics", "refine"}
     required = {"source", "folder", "name", *_DIFFERENCES} - optional
     if not isinstance(facts, dict) or not required <= facts.keys():
         raise UsageError(f"{file}: is not the plan of a sweep")
@@ -304,12 +311,40 @@ def run_cell(task: CellItem) -> CellRun:
     Returns:
         The finished run with its result, ready for the journal of the sweep.
 
-    Raises:
-        ScenarioError: The scenario is not valid or cannot run. The message names the cell.
     """
-    scenario = _build_scenario(task)
-    outcome = sweep_cell.classify_cell(scenario.text, task.plan.longest_s)
+    try:
+        scenario = _build_scenario(task)
+        if task.plan.judge == "linear":
+            outcome = sweep_cell.judge_linearly(scenario)
+        else:
+            outcome = sweep_cell.classify_cell(scenario.text, task.plan.longest_s)
+    except CodeWithheld:
+        raise
+    except ScenarioError as error:
+        return _refuse_cell(task, error)
     return _complete_run(task, scenario, outcome)
+
+
+def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
+    """Returns the result of a cell that is not a valid scenario, or that cannot run.
+
+    Args:
+        task: The run.
+        error: The reason.
+    """
+    cell = task.cell
+    setting = ", ".join(cell.overrides)
+    reason = f"cell {cell.number} ({setting}): {error}"
+    return CellRun(
+        cell=cell.number,
+        seed=task.seed,
+        random=False,
+        law=cell.law,
+        sha256="",
+        scenario=sweep_cell.diff_lines("", task.plan.base.text),
+        outcome=sweep_cell.build_unsimulated_result(CellClass.REFUSED, reason),
+        metrics=dict.fromkeys(task.plan.metrics),
+    )
 
 
 def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
@@ -320,47 +355,40 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
 
     Yields:
         The finished runs in the order of the tasks, equal to those of `run_cell`.
-
-    Raises:
-        ScenarioError: The scenario of a run is not valid or cannot run. The runs before it are
-            yielded first.
     """
-    scenarios = []
-    problem = None
-    for task in tasks:
+    scenarios: dict[int, Scenario] = {}
+    refused: dict[int, CellRun] = {}
+    for index, task in enumerate(tasks):
         try:
-            scenarios.append(_build_scenario(task))
+            scenarios[index] = _build_scenario(task)
+        except CodeWithheld:
+            raise
         except ScenarioError as error:
-            problem = error
-            break
-    texts = [scenario.text for scenario in scenarios]
+            refused[index] = _refuse_cell(task, error)
+    texts = [scenario.text for scenario in scenarios.values()]
     try:
-        judged_cells = list(sweep_cell.classify_cells(texts, tasks[0].plan.longest_s))
-    except CodeFailed:
+        judged_cells = iter(list(sweep_cell.classify_cells(texts, tasks[0].plan.longest_s)))
+    except (CodeFailed, ScenarioError):
         # One by one, the runs before the one whose code fails are kept.
-        for task in tasks:
-            yield run_cell(task)
+        yield from map(run_cell, tasks)
         return
-    for task, scenario, judged in zip(tasks, scenarios, judged_cells, strict=False):
-        run = _complete_run(task, scenario, judged.result)
+    for index, task in enumerate(tasks):
+        if index in refused:
+            yield refused[index]
+            continue
+        judged = next(judged_cells)
+        run = _complete_run(task, scenarios[index], judged.result)
         yield msgspec.structs.replace(run, alone=judged.obstacle)
-    if problem is not None:
-        raise problem
 
 
 def _build_scenario(task: CellItem) -> Scenario:
     """Returns the scenario of a run of a sweep.
 
     Raises:
-        ScenarioError: The scenario is not valid or cannot run. The message names the cell.
+        ScenarioError: The scenario is not valid or cannot run.
     """
-    cell = task.cell
-    try:
-        scenario = task.plan.scenario(*cell.overrides, f"seed={task.seed}")
-        sweep_cell.check_sweepable(scenario)
-    except ScenarioError as error:
-        overrides = ", ".join(cell.overrides)
-        raise ScenarioError(f"cell {cell.number} ({overrides}): {error}") from None
+    scenario = task.plan.scenario(*task.cell.overrides, f"seed={task.seed}")
+    sweep_cell.check_sweepable(scenario)
     return scenario
 
 
@@ -414,6 +442,8 @@ def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
         plan: The sweep.
         runs: Number of runs that remain.
     """
+    if plan.judge == "linear":
+        return False
     rates_hz = [spec.rate_hz for spec in plan.base.sites.values()]
     site_ticks = runs * plan.base.duration_s * sum(rates_hz)
     return site_ticks >= LANE_SITE_TICKS
@@ -425,10 +455,13 @@ def _compile_lanes(plan: SweepPlan) -> None:
     Args:
         plan: The sweep. The code is that of its first cell.
     """
-    from trilat_net.execution.lanes import LEAST_RUNS, group_runs
+    from trilat_net.execution.lanes import group_runs
 
-    scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
-    runs = [FusedRun(scenario) for _ in range(LEAST_RUNS)]
+    try:
+        scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
+    except ScenarioError:
+        return  # the workers compile it
+    runs = [FusedRun(scenario) for _ in range(LANE_RUNS)]
     for group in group_runs(runs):
         group.advance_to(1.0 / max(spec.rate_hz for spec in plan.base.sites.values()))
 
@@ -461,8 +494,12 @@ def estimate_sweep(
         jobs: Number of worker processes of the sweep. None stands for all cores.
     """
     finished = set(done)
-    last_cell = plan.cells - 1
-    numbers = dict.fromkeys(n * last_cell // (_PROBES - 1) for n in range(_PROBES))
+    refinement = EdgeRefinement(plan) if plan.refine else None
+    # A refined sweep must not run other cells than those that it chooses.
+    cells = refinement.list_coarse_cells() if refinement else range(plan.cells)
+    cell_count = refinement.count_most_cells() if refinement else plan.cells
+    last_cell = len(cells) - 1
+    numbers = dict.fromkeys(cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES))
     seed = plan.seeds[0]
     probes = [
         CellItem(plan, plan.cell(number), seed)
@@ -470,12 +507,15 @@ def estimate_sweep(
         if (number, seed) not in finished
     ]
     if not probes:
-        return DurationEstimate(plan.cells * len(plan.seeds) - len(finished), 0.0, [])
+        runs = max(0, cell_count * len(plan.seeds) - len(finished))
+        return DurationEstimate(runs, 0.0, [])
 
     # A short run first: it compiles the simulation kernel, once for all processes.
     brief_s = min(1.0, plan.base.duration_s)
-    brief = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
-    sweep_cell.classify_cell(brief.text, brief_s)
+    if plan.judge != "linear":
+        with suppress(ScenarioError):
+            brief = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
+            sweep_cell.classify_cell(brief.text, brief_s)
 
     clock = SystemClock()
     started_ns = clock.monotonic_ns()
@@ -489,7 +529,7 @@ def estimate_sweep(
 
     # If nothing is random, a cell is run with one seed only.
     seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
-    runs = max(len(entries), plan.cells * seeds - len(finished))
+    runs = max(len(entries), cell_count * seeds - len(finished))
     workers = min(jobs or count_cores(), runs)
     seconds = elapsed_s / len(entries) * runs / workers
     return DurationEstimate(runs, seconds, entries)
@@ -545,99 +585,242 @@ def run_sweep(
     plan = folder.plan
     clock = SystemClock()
     with folder.journal() as journal:
+        tally = _NewRuns()
         for entry in known:
-            journal.add(entry)
-        finished_before = set(journal.done)
+            if (entry.cell, entry.seed) not in journal.done:
+                journal.add(entry)
+                tally.note(entry)
         started_ns = clock.monotonic_ns()
-        left = plan.cells * len(plan.seeds) - len(finished_before)
+        left = plan.cells * len(plan.seeds) - len(journal.done)
         laws = list_imported_code([plan.base])
         workers = on if left else None  # no cluster is needed if nothing is left to run
         with executor.open_worker_pool(
             jobs, workers, most=left, laws=laws, hint=_RESUME_HINT
         ) as pool:
             count = pool.workers
-            _run_cells(plan, journal, pool, progress)
+            _SweepWork(plan, journal, pool, progress, tally).execute()
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
-        new_runs = [run for key, run in journal.done.items() if key not in finished_before]
-        rows = build_result_rows(plan, list(journal.done.values()))
-        reasons = [run.alone for run in journal.done.values() if run.alone]
+        alone = _write_table(folder, journal.done)
 
-    results = SweepResults(plan, rows)
+    results = SweepResults(plan, read_rows(folder.path / RESULTS_FILE, plan))
     if len(plan.seeds) > 1:
-        points = encode_grid_points(plan, collect_grid_points(results))
-        write_whole(folder.path / GRID_POINTS_FILE, points, remedy=folder.remedy)
-    table = encode_results(plan, rows)
-    write_whole(folder.path / RESULTS_FILE, table, remedy=folder.remedy)
+        points = encode_grid_points(plan, iterate_grid_points(results))
+        _write_lines(folder, GRID_POINTS_FILE, points)
     return FinishedSweep(
         results=results,
         folder=folder,
-        runs=len(new_runs),
-        simulated_s=sum(run.outcome.ran_s for run in new_runs),
+        runs=tally.runs,
+        simulated_s=tally.simulated_s,
         wall_s=wall_s,
         jobs=count,
-        alone=Counter(reasons),
+        alone=alone,
     )
 
 
-def _run_cells(
-    plan: SweepPlan,
-    journal: RunJournal[CellRun],
-    pool: executor.WorkerPool,
-    progress: executor.Progress,
-) -> None:
-    """Runs all cells with the first seed, and then the random cells with the other seeds.
+class _NewRuns:
+    """Counts the runs since the last start of a sweep.
 
-    Only the first run of a cell shows whether anything in the cell is random.
+    Attributes:
+        runs: Number of these runs.
+        simulated_s: Simulated time of these runs together, in s.
+    """
+
+    def __init__(self) -> None:
+        self.runs = 0
+        self.simulated_s = 0.0
+
+    def note(self, run: CellRun) -> None:
+        """Counts a run that has finished."""
+        self.runs += 1
+        self.simulated_s += run.outcome.ran_s
+
+
+def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -> Counter[str]:
+    """Writes the table of results, cell by cell.
+
+    Args:
+        folder: Folder of the sweep.
+        done: The finished runs, by cell and seed.
+
+    Returns:
+        The reasons why runs were computed alone, with the number of these runs.
+    """
+    plan = folder.plan
+    reasons: Counter[str] = Counter()
+
+    def iterate_rows() -> Iterator[ResultRow]:
+        for runs in iterate_cells(plan, done):
+            reasons.update(run.alone for run in runs if run.alone)
+            yield from build_cell_rows(plan, runs)
+
+    _write_lines(folder, RESULTS_FILE, ResultTable(plan).encode(iterate_rows()))
+    return reasons
+
+
+def _write_lines(folder: SweepFolder, name: str, lines: Iterable[str]) -> None:
+    """Writes a file of a finished sweep line by line.
+
+    Args:
+        folder: Folder of the sweep.
+        name: Name of the file.
+        lines: The lines.
+
+    Raises:
+        LogRefused: The disk is full. The message states that all runs had finished.
+    """
+    try:
+        write_whole(folder.path / name, lines, remedy=folder.remedy)
+    except LogRefused as error:
+        raise LogRefused(f"{error}; all runs had finished") from None
+
+
+class _SweepWork:
+    """Executes the runs of a sweep that its journal lacks.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
         journal: Journal, to which the runs are added.
         pool: Workers that execute the runs.
         progress: Function that is called as for `run_sweep`.
+        tally: Counts the runs.
     """
-    first_seed, *other_seeds = plan.seeds
 
-    def execute_missing_runs(runs: Iterable[tuple[int, int]], run_count: int) -> None:
+    def __init__(
+        self,
+        plan: SweepPlan,
+        journal: RunJournal[CellRun],
+        pool: executor.WorkerPool,
+        progress: executor.Progress,
+        tally: _NewRuns,
+    ) -> None:
+        self._plan = plan
+        self._journal = journal
+        self._pool = pool
+        self._progress = progress
+        self._tally = tally
+
+    def execute(self) -> None:
+        """Executes all runs, or in a refined sweep those along the stability edge."""
+        plan = self._plan
+        if not plan.refine:
+            is_side_by_side = self._choose_lanes(plan.cells)
+            cells: Iterable[int] = range(plan.cells)
+            if is_side_by_side:
+                groups = find_cell_groups(plan)
+                cells = groups.iterate_cells(plan.shape) if groups.keys else cells
+            self._execute_cells(cells, plan.cells, 0, is_side_by_side=is_side_by_side)
+            return
+
+        refinement = EdgeRefinement(plan)
+        is_side_by_side = self._choose_lanes(refinement.count_most_cells())
+        runs_before = 0
+        sides: dict[int, int] = {}
+        while cells := refinement.find_next_cells(sides):
+            self._execute_cells(cells, len(cells), runs_before, is_side_by_side=is_side_by_side)
+            sides = {}
+            for cell in cells:
+                runs = self._list_runs(cell)
+                runs_before += len(runs)
+                sides[cell] = find_side(plan, runs)
+
+    def _choose_lanes(self, cells: int) -> bool:
+        """Returns True if runs are to be computed side by side, and compiles their code.
+
+        Args:
+            cells: Number of cells that have to run.
+        """
+        is_side_by_side = _uses_lanes(self._plan, cells - len(self._journal.done))
+        if is_side_by_side:
+            _compile_lanes(self._plan)
+        return is_side_by_side
+
+    def _list_runs(self, cell: int) -> list[CellRun]:
+        """Returns the finished runs of a cell, in the order of the seeds."""
+        done = self._journal.done
+        return [done[cell, seed] for seed in self._plan.seeds if (cell, seed) in done]
+
+    def _execute_cells(
+        self, cells: Iterable[int], count: int, runs_before: int, *, is_side_by_side: bool
+    ) -> None:
+        """Executes cells with the first seed, and then the random ones with the other seeds.
+
+        Only the first run of a cell shows whether anything in the cell is random.
+
+        Args:
+            cells: Numbers of the cells, which can be iterated once.
+            count: Number of the cells.
+            runs_before: Number of runs of the cells before.
+            is_side_by_side: True to compute several runs side by side.
+        """
+        first_seed, *other_seeds = self._plan.seeds
+        numbers: Iterable[int] = list(cells) if other_seeds else cells
+        self._execute_runs(
+            ((number, first_seed) for number in numbers),
+            runs_before + count,
+            is_side_by_side=is_side_by_side,
+        )
+        if not other_seeds:
+            return
+        random_cells = [
+            number for number in numbers if self._journal.done[number, first_seed].random
+        ]
+        self._execute_runs(
+            ((number, seed) for number in random_cells for seed in other_seeds),
+            runs_before + count + len(random_cells) * len(other_seeds),
+            is_side_by_side=is_side_by_side,
+        )
+
+    def _execute_runs(
+        self, runs: Iterable[tuple[int, int]], run_count: int, *, is_side_by_side: bool
+    ) -> None:
         """Executes runs of the sweep, except runs that the journal contains already.
 
-        The plan, the journal, the workers and the progress function are those of `_run_cells`.
         The journal sends the runs to the workers, and stores the results.
 
         Args:
             runs: Pairs of the number of a cell, a combination of parameters, and a seed.
             run_count: Number of all runs of the sweep so far, with those in the journal, for
                 the progress.
+            is_side_by_side: True to compute several runs side by side.
         """
+        plan = self._plan
+        done = self._journal.done
         missing_runs = (
             CellItem(plan, plan.cell(number), seed)
             for number, seed in runs
-            if (number, seed) not in journal.done
+            if (number, seed) not in done
         )
-        runs_side_by_side = _uses_lanes(plan, run_count - len(journal.done))
-        if runs_side_by_side:
-            _compile_lanes(plan)
-        journal.run_pending(
-            pool=pool,
+        # Runs of an estimate may belong to cells that come later.
+        total = max(run_count, len(done))
+        self._journal.run_pending(
+            pool=self._pool,
             run=run_cell,
             tasks=missing_runs,
-            done=len(journal.done),
-            total=run_count,
-            show=progress,
-            together=run_cells if runs_side_by_side else None,
-            together_count=LANE_RUNS if runs_side_by_side else 1,
+            done=len(done),
+            total=total,
+            show=self._progress,
+            together=run_cells if is_side_by_side else None,
+            together_count=LANE_RUNS if is_side_by_side else 1,
+            note=self._tally.note,
         )
 
-    first_runs = ((number, first_seed) for number in range(plan.cells))
-    execute_missing_runs(first_runs, plan.cells)
 
-    random_cells = list[int]()
-    if other_seeds:
-        random_cells = [
-            number for number in range(plan.cells) if journal.done[number, first_seed].random
-        ]
-    repetitions = ((number, seed) for number in random_cells for seed in other_seeds)
-    run_count = plan.cells + len(random_cells) * len(other_seeds)
-    execute_missing_runs(repetitions, run_count)
+def find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
+    """Returns the side of the stability edge on which the runs of a cell lie.
+
+    Args:
+        plan: The sweep. If it measures growth exponents, their sign decides.
+        runs: The runs of the cell.
+    """
+    outcomes = [run.outcome for run in runs]
+    if all(outcome.verdict is CellClass.REFUSED for outcome in outcomes):
+        return NOT_KNOWN
+    stable = [outcome.verdict.stable for outcome in outcomes]
+    if plan.judge != "verdict":
+        exponents_per_s = [outcome.exponent_per_s for outcome in outcomes]
+        stable = [None if rate is None else rate <= 0.0 for rate in exponents_per_s]
+    decided = [is_stable for is_stable in stable if is_stable is not None]
+    return choose_side(stable=sum(decided), decided=len(decided))
 
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:

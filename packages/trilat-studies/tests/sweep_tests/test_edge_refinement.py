@@ -1,0 +1,179 @@
+"""A refined sweep finds the edge of the full grid with few of its cells."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
+from trilat_studies.sweep.edge_refinement import (
+    NOT_KNOWN,
+    STABLE,
+    UNDECIDED,
+    UNSTABLE,
+    EdgeRefinement,
+    choose_side,
+)
+from trilat_studies.sweep.stability_map import build_stability_map, find_map_edges
+from trilat_studies.sweep.sweep_cell import CellClass, CellResult
+from trilat_studies.sweep.sweep_plan import SweepPlan, parse_axis, plan_sweep
+from trilat_studies.sweep.sweep_results import RESULTS_FILE
+from trilat_studies.sweep.sweep_run import open_sweep_folder
+
+from trilat_net.errors import UsageError
+from trilat_net.scenario import parse_scenario
+
+from .quick import outcome_of
+
+Side = Callable[[float, float], int]
+AXES = ("link.delay_ms=0:160:10", "control.d=0.2:3.4:0.2")
+
+
+@cache
+def small_plan() -> SweepPlan:
+    return plan_sweep("p_d_margin", ["duration_s=2"], over=AXES)
+
+
+def grid(x: int, y: int, refine: int) -> SweepPlan:
+    """Returns a plan with so many values on its axes."""
+    axes = (f"link.delay_ms=0:{x - 1}:1", f"control.d=0.001:{y / 1000}:0.001")
+    return small_plan()._replace(axes=tuple(map(parse_axis, axes)), refine=refine)
+
+
+def refine_all(plan: SweepPlan, side_at: Side) -> tuple[np.ndarray, np.ndarray]:
+    """Runs a refinement on a grid with known sides.
+
+    Returns:
+        The known sides, and those of the cells that the refinement chose.
+    """
+    _, columns, rows = plan.shape
+    full = np.array([[side_at(i, j) for j in range(rows)] for i in range(columns)])
+    refinement = EdgeRefinement(plan)
+    found = np.full(full.shape, NOT_KNOWN)
+    sides: dict[int, int] = {}
+    while cells := refinement.find_next_cells(sides):
+        assert (found.reshape(-1)[cells] == NOT_KNOWN).all()
+        sides = {cell: int(full.reshape(-1)[cell]) for cell in cells}
+        found.reshape(-1)[cells] = full.reshape(-1)[cells]
+    return full, found
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(1, 5),
+    st.integers(2, 70),
+    st.integers(2, 70),
+    st.floats(-40.0, 110.0),
+    st.floats(0.0, 3.0),
+    st.floats(0.2, 4.0),
+    st.booleans(),
+)
+def test_both_sides_of_a_rising_edge_run(
+    refine: int, x: int, y: int, first: float, slope: float, bend: float, stable_below: bool
+) -> None:
+    def side_at(i: float, j: float) -> int:
+        return int((j < first + slope * x * (i / x) ** bend) == stable_below)
+
+    full, found = refine_all(grid(x, y, refine), side_at)
+    ran = found != NOT_KNOWN
+    for axis in (0, 1):
+        differs = np.diff(full, axis=axis) != 0
+        both_ran = np.delete(ran, -1, axis) & np.delete(ran, 0, axis)
+        assert not (differs & ~both_ran).any()
+
+
+def test_a_fine_grid_needs_few_of_its_cells() -> None:
+    def side_at(i: float, j: float) -> int:
+        return STABLE if j > 30 + 120 * (i / 200) ** 0.5 else UNSTABLE
+
+    full, found = refine_all(grid(201, 201, 5), side_at)
+    assert np.count_nonzero(found != NOT_KNOWN) <= full.size / 20
+
+
+def test_cells_without_a_side_draw_no_edge() -> None:
+    """A part of the grid is not valid; its border is not refined."""
+    full, found = refine_all(grid(65, 65, 4), lambda i, _: NOT_KNOWN if i > 30 else STABLE)
+    coarse = EdgeRefinement(grid(65, 65, 4)).list_coarse_cells()
+    assert np.count_nonzero(found == STABLE) == np.count_nonzero(
+        full.reshape(-1)[coarse] == STABLE
+    )
+
+
+def test_a_cell_has_the_side_of_most_runs() -> None:
+    assert choose_side(stable=0, decided=0) == UNDECIDED
+    assert choose_side(stable=1, decided=2) == UNDECIDED
+    assert choose_side(stable=2, decided=3) == STABLE
+    assert choose_side(stable=1, decided=3) == UNSTABLE
+
+
+@pytest.mark.parametrize(
+    ("over", "refine"),
+    [
+        (AXES, -1),
+        (AXES, 99),
+        (("control.law=p_d,adaptive",), 2),
+        ((), 1),
+        (("link.delay_ms=0:160:1e-6", AXES[1]), 2),
+    ],
+)
+def test_a_sweep_that_cannot_be_refined_is_refused(over: tuple[str, ...], refine: int) -> None:
+    with pytest.raises(UsageError, match="refine"):
+        plan_sweep("p_d_margin", over=over, refine=refine)
+
+
+def judge_by_line(text: str, longest_s: float) -> CellResult:
+    """Stands for the judge: stable above a straight edge."""
+    scenario = parse_scenario(text)
+    delay_ms = scenario.links["m1->s"].delay_ms  # type: ignore[attr-defined]
+    d = scenario.sites["s"].control.d[0]  # type: ignore[attr-defined]
+    verdict = CellClass.CONVERGED if d > 0.7 + 0.013 * delay_ms else CellClass.BOUNDED
+    outcome = outcome_of(text, longest_s)
+    return CellResult(**{**outcome_fields(outcome), "verdict": verdict, "diverged_s": None})
+
+
+def outcome_fields(outcome: CellResult) -> dict[str, object]:
+    return {name: getattr(outcome, name) for name in outcome.__struct_fields__}
+
+
+class _StopError(Exception):
+    pass
+
+
+def test_an_interrupted_refinement_ends_as_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its rows are those of the full sweep, and so are its edges."""
+    monkeypatch.setattr(sweep_cell, "classify_cell", judge_by_line)
+    plan = small_plan()._replace(refine=2)
+    whole = run_sweep(prepare_sweep_folder(small_plan(), tmp_path / "whole"), 1)
+    refined = run_sweep(prepare_sweep_folder(plan, tmp_path / "refined"), 1)
+    rows_of_whole = {row["cell"]: row for row in whole.results.rows}
+    runs = len(refined.results.rows)
+    assert 25 < runs < 0.5 * len(rows_of_whole)
+    assert all(rows_of_whole[row["cell"]] == row for row in refined.results.rows)
+
+    folder = prepare_sweep_folder(plan, tmp_path / "parts")
+    for stop in (3, 26, runs - 1):
+
+        def stopped(done: int, _total: int, stop: int = stop) -> None:
+            if done >= stop:
+                raise _StopError
+
+        with pytest.raises(_StopError):
+            run_sweep(folder, 1, stopped)
+        folder = open_sweep_folder(folder.path)
+        assert len(folder.read_done()) == stop
+    assert run_sweep(folder, 1).runs == 1
+    table = (tmp_path / "refined" / RESULTS_FILE).read_bytes()
+    assert (folder.path / RESULTS_FILE).read_bytes() == table
+
+    planes = [
+        build_stability_map(swept.results, (), linearly=False).plane
+        for swept in (whole, refined)
+    ]
+    edges = [find_map_edges(plane, plane.panels[0]) for plane in planes]
+    assert edges[0] == edges[1]
+    assert len(edges[0]) >= len(planes[0].x.values) - 1

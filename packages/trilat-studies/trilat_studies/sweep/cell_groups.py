@@ -1,0 +1,120 @@
+"""Divides the cells of a sweep into groups whose runs differ in numbers only.
+
+Runs that differ in numbers only, for example in a gain, can be computed side by side. An axis
+may also change the structure of the scenario: the control law, the joints of an arm, the sites
+or their tick rates. The cells are then run group by group, so that every worker gets runs of
+one structure.
+
+Invariant:
+    - Every cell of the grid belongs to exactly one group.
+    - Groups change the order of the runs, and no result.
+"""
+
+from collections.abc import Hashable, Iterator, Sequence
+from itertools import product
+from math import prod
+from typing import NamedTuple
+
+from trilat_net.errors import ScenarioError, count_nouns
+from trilat_net.execution.fused import FusedRun
+from trilat_net.execution.lanes import describe_structure
+
+from . import sweep_cell
+from .sweep_plan import SweepPlan, spread_indices
+
+LAW_KEY = "law"
+"""Name of the dimension of the control laws."""
+
+
+class CellGroups(NamedTuple):
+    """Groups of the cells of a sweep whose runs have the same structure.
+
+    Attributes:
+        keys: Keys of the axes that change the structure.
+        parts: For each dimension of the grid, its indices as parts of equal structure. The law
+            is the first dimension.
+    """
+
+    keys: tuple[str, ...]
+    parts: tuple[tuple[Sequence[int], ...], ...]
+
+    @property
+    def group_count(self) -> int:
+        """Number of groups: the product of the numbers of parts."""
+        return prod(map(len, self.parts))
+
+    @property
+    def sentence(self) -> str:
+        """Sentence on the groups for the user. Empty if there is only one."""
+        if not self.keys:
+            return ""
+        change = "changes" if len(self.keys) == 1 else "change"
+        keys = " and ".join(self.keys)
+        groups = count_nouns(self.group_count, "group")
+        return (
+            f"{keys} {change} the structure: {groups} of cells, which run one after the other"
+        )
+
+    def iterate_cells(self, shape: Sequence[int]) -> Iterator[int]:
+        """Yields the numbers of all cells, group by group.
+
+        Args:
+            shape: Size of the grid.
+        """
+        for group in product(*self.parts):
+            for indices in product(*group):
+                number = 0
+                for count, index in zip(shape, indices, strict=True):
+                    number = number * count + index
+                yield number
+
+
+def find_cell_groups(plan: SweepPlan) -> CellGroups:
+    """Finds the axes of a sweep that change the structure of the scenario.
+
+    Up to 32 values of each axis are compared, with the other axes at their first values. If
+    they differ and the axis has more values, each of its values is a group of its own.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+    """
+    names = (LAW_KEY, *(axis.key for axis in plan.axes))
+    keys = []
+    parts: list[tuple[Sequence[int], ...]] = []
+    for dimension, (name, count) in enumerate(zip(names, plan.shape, strict=True)):
+        checked = spread_indices(count)
+        indices_of: dict[Hashable, list[int]] = {}
+        for index in checked:
+            structure = _find_structure(plan, dimension, index) if count > 1 else None
+            indices_of.setdefault(structure, []).append(index)
+        if len(indices_of) == 1:
+            parts.append((range(count),))
+            continue
+        keys.append(name)
+        if len(checked) == count:
+            parts.append(tuple(map(tuple, indices_of.values())))
+        else:
+            parts.append(tuple((index,) for index in range(count)))
+    return CellGroups(tuple(keys), tuple(parts))
+
+
+def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
+    """Returns the structure of the first cell with a given value on one axis.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        dimension: Dimension of the axis in the grid.
+        index: Index of its value.
+
+    Returns:
+        The structure. It is the obstacle to running side by side if there is one, and None if
+        the cell is not a valid scenario.
+    """
+    stride = prod(plan.shape[dimension + 1 :])
+    cell = plan.cell(index * stride)
+    try:
+        scenario = plan.scenario(*cell.overrides)
+        sweep_cell.check_sweepable(scenario)
+        return describe_structure(FusedRun(scenario))
+    except ScenarioError:
+        return None

@@ -1,0 +1,152 @@
+"""Chooses the cells of a sweep that lie along the stability edge.
+
+A sweep runs a scenario on a grid of parameters, and a cell is one point of this grid. The
+stability edge separates stable from unstable cells. A refined sweep first runs a coarse part of
+the grid. Then it halves the boxes that the edge crosses, again and again, until their corners
+are neighbours in the grid.
+
+Invariant:
+    - The chosen cells are a function of the plan and of the results. They do not depend on the
+      order of the runs or on interruptions.
+    - A box is halved if two of its known points lie on different sides of the edge. An edge
+      that enters and leaves a coarse box between two of its corners is not seen.
+    - A cell is chosen at most once.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sweep_plan import SweepPlan, list_refined_axes
+
+_Sides = NDArray[np.int8]
+
+NOT_KNOWN = -1
+"""Side of a cell that has not run, or that is not a valid scenario."""
+UNSTABLE, STABLE, UNDECIDED = range(3)
+"""Sides of the stability edge."""
+
+
+def choose_side(*, stable: int, decided: int) -> int:
+    """Returns the side of the edge on which a cell lies.
+
+    Args:
+        stable: Number of stable runs of the cell.
+        decided: Number of runs that are stable or not stable.
+    """
+    if 2 * stable == decided:
+        return UNDECIDED  # without a decided run, or without a majority
+    return STABLE if 2 * stable > decided else UNSTABLE
+
+
+class EdgeRefinement:
+    """Cells of a refined sweep, in the order in which they are to be run.
+
+    Args:
+        plan: The sweep, whose `refine` is the number of halvings.
+    """
+
+    def __init__(self, plan: SweepPlan) -> None:
+        # The law is the first dimension of the grid.
+        self._dimensions = [1 + n for n in list_refined_axes(plan.axes)]
+        self._shape = plan.shape
+        self._halvings = plan.refine
+        self._level = 0
+        self._sides: _Sides = np.full(plan.cells, NOT_KNOWN, np.int8)
+        self._chosen = np.zeros(plan.cells, bool)
+
+    def find_next_cells(self, sides: Mapping[int, int]) -> list[int]:
+        """Returns the cells that are to be run next.
+
+        Args:
+            sides: Side of each cell that has run since the last call.
+
+        Returns:
+            Numbers of the cells, in ascending order. Empty if the refinement is complete.
+        """
+        for number, side in sides.items():
+            self._sides[number] = side
+        while self._level <= self._halvings:
+            wanted = np.zeros(self._shape, bool)
+            for panel in self._iterate_panels():
+                wanted[panel] = self._mark_panel(panel)
+            missing = np.flatnonzero(wanted.reshape(-1) & ~self._chosen)
+            if len(missing):
+                self._chosen[missing] = True
+                numbers: list[int] = missing.tolist()
+                return numbers
+            self._level += 1
+        return []
+
+    def list_coarse_cells(self) -> list[int]:
+        """Returns the numbers of the cells with which the sweep begins."""
+        wanted = np.zeros(self._shape, bool)
+        for panel in self._iterate_panels():
+            wanted[panel] = self._mark_lattice()
+        numbers: list[int] = np.flatnonzero(wanted).tolist()
+        return numbers
+
+    def count_most_cells(self) -> int:
+        """Estimates the number of cells, for an edge that crosses each panel once."""
+        panels = sum(1 for _ in self._iterate_panels())
+        along_edge = 0
+        for level in range(self._halvings):
+            lines = [len(self._find_lines(dimension, level)) for dimension in self._dimensions]
+            along_edge += 3 * sum(lines)
+        cells = len(self.list_coarse_cells()) + panels * along_edge
+        return min(math.prod(self._shape), cells)
+
+    def _iterate_panels(self) -> Iterator[tuple[int | slice, ...]]:
+        """Yields the index of each panel: a setting of the law and of the other axes."""
+        indices: list[list[int | slice]] = []
+        for dimension, count in enumerate(self._shape):
+            is_refined = dimension in self._dimensions
+            indices.append([slice(None)] if is_refined else list(range(count)))
+        yield from itertools.product(*indices)
+
+    def _find_lines(self, dimension: int, level: int) -> NDArray[np.int64]:
+        """Returns the indices of one axis between which the boxes of a level lie."""
+        last = self._shape[dimension] - 1
+        stride = 1 << (self._halvings - level)
+        return np.unique([*range(0, last, stride), last])
+
+    def _mark_lattice(self) -> NDArray[np.bool_]:
+        """Returns a panel in which all corners of the boxes of level 0 are marked."""
+        wanted = np.zeros([self._shape[dimension] for dimension in self._dimensions], bool)
+        lines = [self._find_lines(dimension, 0) for dimension in self._dimensions]
+        wanted[np.ix_(*lines)] = True
+        return wanted
+
+    def _mark_panel(self, panel: tuple[int | slice, ...]) -> NDArray[np.bool_]:
+        """Returns a panel in which the cells are marked that the present level needs.
+
+        Args:
+            panel: Index of the panel.
+        """
+        if self._level == 0:
+            return self._mark_lattice()
+        sides = self._sides.reshape(self._shape)[panel]
+        chosen = self._chosen.reshape(self._shape)[panel]
+        wanted = np.zeros(sides.shape, bool)
+        coarse = [self._find_lines(n, self._level - 1) for n in self._dimensions]
+        fine = [self._find_lines(n, self._level) for n in self._dimensions]
+
+        has_corners = chosen[np.ix_(*coarse)]
+        for axis in range(len(coarse)):
+            # A box needs both of its corners along each axis.
+            has_corners = np.delete(has_corners, -1, axis) & np.delete(has_corners, 0, axis)
+        for box in np.argwhere(has_corners):
+            inside = []
+            for index, corners, lines in zip(box, coarse, fine, strict=True):
+                low, high = corners[index : index + 2]
+                inside.append(lines[(lines >= low) & (lines <= high)])
+            points = np.ix_(*inside)
+            # A point between two corners may be known from the box beside this one.
+            known = sides[points]
+            known = known[known != NOT_KNOWN]
+            if len(known) and (known != known[0]).any():
+                wanted[points] = True
+        return wanted

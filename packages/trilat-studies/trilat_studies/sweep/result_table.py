@@ -1,0 +1,314 @@
+"""Reads and writes the table of results of a sweep, `results.csv`, one row at a time.
+
+A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore a
+table is written row by row, and the rows of a large table stay in its file.
+
+Invariant:
+    - Reading the CSV table restores all numbers bit for bit.
+    - A row in memory and the same row in the file are equal.
+"""
+
+import csv
+import io
+import json
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, overload
+
+from trilat_net.errors import UsageError
+
+from .sweep_cell import CellResult, apply_diff, diff_lines
+from .sweep_plan import SweepPlan
+
+ResultRow = Mapping[str, Any]
+"""One run, as a mapping with these keys: `cell`, the value of each axis under the key of the
+axis, `law`, `seed`, `random`, the further metrics under their keys, all fields of `CellResult`,
+`scenario_sha256`, `command` and `scenario`. The classes of the run are texts. `scenario` is the
+canonical text of the scenario that was run.
+"""
+ROWS_IN_MEMORY = 20_000
+"""Number of rows up to which the rows of a table are kept in memory, about 5 kB each."""
+_SCENARIO_COLUMN = "scenario_changes"
+"""Column of the CSV table with the scenario of the row. To save space it contains only the
+differences from the swept scenario, as JSON.
+"""
+
+_LONGEST_CELL = 2**26
+"""Largest number of characters in a cell of the CSV table. A scenario that contains a delay
+trace exceeds the default limit of the csv module, 131 072 characters.
+"""
+
+
+def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Iterator[str]:
+    """Yields the CSV text of a header and of each row, so that a table may be large.
+
+    Args:
+        rows: The rows, as values by column.
+        columns: The columns.
+    """
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    yield stream.getvalue()
+    for row in rows:
+        stream.seek(0)
+        stream.truncate()
+        writer.writerow(row)
+        yield stream.getvalue()
+
+
+class ResultTable:
+    """Columns of the table of results of a sweep.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+    """
+
+    def __init__(self, plan: SweepPlan) -> None:
+        self._plan = plan
+        self._kinds = _list_result_columns(plan)
+        self._has_text_axis = not all(axis.numeric for axis in plan.axes)
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of all columns, in the order of the file."""
+        return [*self._kinds, _SCENARIO_COLUMN]
+
+    def encode(self, rows: Iterable[ResultRow]) -> Iterator[str]:
+        """Yields the header of the table, and the text of each row.
+
+        Args:
+            rows: The runs, one mapping from columns to values per run.
+        """
+        yield from iterate_csv(map(self._format_row, rows), self.columns)
+
+    def _format_row(self, row: ResultRow) -> dict[str, str]:
+        """Returns the texts of a row, by column."""
+        line = {name: format_table_cell(row[name], kind) for name, kind in self._kinds.items()}
+        changes = diff_lines(row["scenario"], self._plan.base.text)
+        line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
+        return line
+
+    def parse(self, line: Mapping[str, str]) -> ResultRow:
+        """Returns the row of a line of the CSV table, with the complete text of its scenario.
+
+        Args:
+            line: Texts of the line, by column.
+        """
+        row = {name: _parse_cell(line[name], kind) for name, kind in self._kinds.items()}
+        # A run that was not simulated has no motion.
+        row["motion"] = row["motion"] or None
+        if self._has_text_axis:
+            # An axis of words may contain numbers, whose texts do not show that they are.
+            values = self._plan.cell(row["cell"]).values
+            for axis, value in zip(self._plan.axes, values, strict=True):
+                row[axis.key] = value
+        row["scenario"] = apply_diff(json.loads(line[_SCENARIO_COLUMN]), self._plan.base.text)
+        return row
+
+
+class StoredRows(Sequence[ResultRow]):
+    """Rows of a table of results, which stay in its file and are read when they are needed.
+
+    Only the offsets of the rows are in memory, 8 bytes for each.
+
+    Args:
+        file: The CSV table.
+        table: Its columns.
+
+    Raises:
+        UsageError: The file cannot be read, or a column is missing.
+    """
+
+    def __init__(self, file: Path, table: ResultTable) -> None:
+        self._file = file
+        self._table = table
+        self._offsets = array("q")
+        offset = 0
+        quotes = 0
+        with self._explaining_errors():
+            with file.open("rb") as stream:
+                for line in stream:
+                    # A line feed between quotation marks belongs to a text.
+                    if quotes % 2 == 0:
+                        self._offsets.append(offset)
+                    quotes += line.count(b'"')
+                    offset += len(line)
+            self._offsets.append(offset)
+            with file.open(encoding="utf-8", newline="") as stream:
+                self._names = _read_next(csv.reader(stream, strict=True)) or []
+        for name in table.columns:
+            if name not in self._names:
+                raise UsageError(
+                    f"{file}: contains no results of a sweep: the column {name!r} is missing"
+                )
+
+    def __len__(self) -> int:
+        return max(0, len(self._offsets) - 2)  # the header, and the end of the file
+
+    @overload
+    def __getitem__(self, index: int) -> ResultRow: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[ResultRow]: ...
+
+    def __getitem__(self, index: int | slice) -> ResultRow | list[ResultRow]:
+        if isinstance(index, slice):
+            return [self[n] for n in range(len(self))[index]]
+        number = range(len(self))[index] + 1
+        first, stop = self._offsets[number : number + 2]
+        with self._explaining_errors():
+            with self._file.open("rb") as stream:
+                stream.seek(first)
+                text = stream.read(stop - first).decode()
+            fields = _read_next(csv.reader(io.StringIO(text, newline=""), strict=True))
+            return self._table.parse(self._name_fields(fields or []))
+
+    def __iter__(self) -> Iterator[ResultRow]:
+        for line in self._iterate_lines():
+            with self._explaining_errors():
+                row = self._table.parse(line)
+            yield row
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Sequence) or len(self) != len(other):
+            return NotImplemented if not isinstance(other, Sequence) else False
+        return all(row == other_row for row, other_row in zip(self, other, strict=True))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def find_cell(self, number: int) -> list[ResultRow]:
+        """Returns the rows of one cell.
+
+        Args:
+            number: Number of the cell.
+        """
+        text = str(number)
+        lines = [line for line in self._iterate_lines() if line["cell"] == text]
+        with self._explaining_errors():
+            return [self._table.parse(line) for line in lines]
+
+    def _iterate_lines(self) -> Iterator[dict[str, str]]:
+        """Yields the texts of each row, by column."""
+        with (
+            self._explaining_errors(),
+            self._file.open(encoding="utf-8", newline="") as stream,
+        ):
+            reader = csv.reader(stream, strict=True)
+            _read_next(reader)
+            while (fields := _read_next(reader)) is not None:
+                if fields:
+                    yield self._name_fields(fields)
+
+    def _name_fields(self, fields: Sequence[str]) -> dict[str, str]:
+        """Returns the texts of a row by column.
+
+        Raises:
+            ValueError: The row has too few or too many fields.
+        """
+        return dict(zip(self._names, fields, strict=True))
+
+    @contextmanager
+    def _explaining_errors(self) -> Iterator[None]:
+        """Replaces errors of a damaged table by one that names the file.
+
+        Raises:
+            UsageError: The table cannot be read.
+        """
+        try:
+            yield
+        except (OSError, ValueError, TypeError, IndexError, KeyError, csv.Error) as error:
+            raise UsageError(
+                f"{self._file}: cannot be read as results of a sweep: {error}"
+            ) from None
+
+
+def read_rows(file: Path, plan: SweepPlan) -> Sequence[ResultRow]:
+    """Reads the table of results of a sweep. The rows of a large table stay in the file.
+
+    Args:
+        file: The CSV table.
+        plan: The sweep: its scenario, axes, control laws and seeds.
+
+    Raises:
+        UsageError: The table cannot be read.
+    """
+    rows = StoredRows(file, ResultTable(plan))
+    return list(rows) if len(rows) <= ROWS_IN_MEMORY else rows
+
+
+def _read_next(reader: Iterator[list[str]]) -> list[str] | None:
+    """Reads the next row of a CSV table, whose cells may hold the whole text of a scenario.
+
+    The limit of the csv module applies to the whole process. Therefore it is raised only here.
+
+    Returns:
+        The fields of the row. None after the last row.
+    """
+    limit = csv.field_size_limit(_LONGEST_CELL)
+    try:
+        return next(reader, None)
+    finally:
+        csv.field_size_limit(limit)
+
+
+def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
+    """Returns the columns of the CSV table in their order, each with the type of its values.
+
+    The column with the scenario is not listed, because it needs special treatment.
+    """
+    column_types = {**list_axis_columns(plan), "seed": int, "random": bool}
+    # All fields of a result are numbers, except those whose types are corrected below.
+    number_columns = (*plan.metrics, *CellResult.__struct_fields__)
+    column_types |= dict.fromkeys(number_columns, float)
+    text_columns = ("verdict", "motion", "reasons", "stability", "rests_on", "scenario_sha256")
+    column_types |= dict.fromkeys((*text_columns, "command"), str)
+    return column_types | {"extended": int}
+
+
+def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
+    """Returns the columns that identify a cell, with their types: number, axes and law.
+
+    The types serve to read the CSV table again.
+    """
+    column_types: dict[str, type] = {"cell": int}
+    for axis in plan.axes:
+        column_types[axis.key] = float if axis.numeric else str
+    column_types["law"] = str
+    return column_types
+
+
+def format_table_cell(value: Any, kind: type) -> str:
+    """Returns the text of a cell of the CSV table, from which numbers parse back bit for bit.
+
+    Args:
+        value: The value. None becomes an empty text.
+        kind: Type of the column.
+    """
+    if value is None:
+        return ""
+    if kind is bool:
+        return "true" if value else "false"
+    return repr(float(value)) if kind is float else str(value)
+
+
+def _parse_cell(text: str, kind: type) -> Any:
+    """Returns the value of a cell of the CSV table; the inverse of `format_table_cell`.
+
+    Args:
+        text: Text of the cell.
+        kind: Type of the column.
+
+    Raises:
+        ValueError: The text is not a number although the column contains numbers.
+            It is neither "true" nor "false" although the column contains bools.
+    """
+    if kind is str:
+        return text
+    if kind is bool:
+        if text not in ("true", "false"):
+            raise ValueError(f"{text!r} is neither true nor false")
+        return text == "true"
+    return kind(text) if text else None
