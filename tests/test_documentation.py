@@ -223,6 +223,7 @@ COMMAND_PAGES = {
     "docs/reference/links.md",
     "docs/studies/linear.md",
     "docs/overview.md",
+    "docs/studies/policies.md",
     "docs/reference/metrics.md",
     "docs/reference/silent-peers.md",
     "docs/reference/stability.md",
@@ -258,6 +259,9 @@ def prepare(page: str, folder: Path) -> None:
         session = folder / "runs" / "play-001"
         session.mkdir(parents=True)
         trilat("sim", "play", "--duration", "3", "-o", "run.mcap", cwd=session).succeeds()
+    if page == "docs/studies/policies.md":
+        (code, *_) = find_blocks(page)
+        (folder / "my_policy.py").write_text(code.text)
     if page == "docs/extend/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/extend/arms.md":
