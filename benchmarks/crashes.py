@@ -8,7 +8,7 @@ from statistics import median
 from tests.live.killing import SITES, killed
 from tests.live.processes import Session, Stage
 from tests.live.small_disks import NoSmallDisk, small_disk
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.net import topics
 from trilat_net.net.messages import LinkStats
 from trilat_net.net.wire import decode

@@ -13,10 +13,10 @@ import numpy as np
 import trilat_net
 from tests.live.processes import HOLDER, PAPER, Session, Stage, connections
 from tests.sites.devices import HaplyService
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
-from trilat_net.net.connection import resolve_member_connection
+from trilat_net.net.connection import Connection
 from trilat_net.net.zenoh_bus import ZenohBus
 
 MOVES, DURATION_S = 1000, 60
@@ -139,7 +139,7 @@ def _describe_kill(log: Log, killed_ns: int) -> list[str]:
 
 def _flood(session: Session) -> tuple[int, int, int]:
     """Sends garbage to the hand of s as fast as it goes; returns begin and end, ns, and how many."""
-    connection = resolve_member_connection(None, session.endpoints, None, None, [], None)
+    connection = Connection.of_member(None, session.endpoints, None, None, [], None)
     bus = ZenohBus([], connection.connect or ())
     time.sleep(2.0)
     publish, sent, begun_ns = (

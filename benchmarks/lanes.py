@@ -83,11 +83,11 @@ def _compare(case: Case, width: int) -> str:
 def _compare_twins() -> list[str]:
     """Times the twins of a certificate, and the certificate, both ways in turn."""
     log = tn.simulate("paper", duration_s=20)
-    pushes = twins.choose_pushes(log.scenario)
+    pushes = twins.Push.choose(log.scenario)
     least_runs = twin_lanes.LEAST_RUNS
     least_site_ticks = twins.LANE_SITE_TICKS
     works: dict[str, Callable[[], object]] = {
-        "the twins": lambda: twins.run_twins(log, pushes),
+        "the twins": lambda: twins.Twins.of_log(log, pushes),
         "certify": lambda: tn.certify(log),
     }
     times_s: dict[tuple[str, bool], list[float]] = {}

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from trilat_net.app.demo_session import run_demo
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import Scenario, load_scenario

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
-from trilat_net.execution import verify, virtual
+from trilat_net.execution import verification, virtual
 from trilat_net.log import mcap_reader, site_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
@@ -33,10 +33,12 @@ def run() -> list[str]:
 
 def _compare(name: str, path: Path) -> str:
     """Times both ways for one log, in turn."""
-    records = verify.verify(open_log(path)).identical  # compiles
+    records = verification.verify(open_log(path)).identical  # compiles
     pairs = []
     for _ in range(ROUNDS):
-        fast_s = min(_processor_s(lambda: verify.verify(open_log(path))) for _ in range(3))
+        fast_s = min(
+            _processor_s(lambda: verification.verify(open_log(path))) for _ in range(3)
+        )
         pairs.append((fast_s, _processor_s(lambda: verify_singly(path))))
     ratio = statistics.median(single_s / fast_s for fast_s, single_s in pairs)
     fast_s, single_s = (min(times) for times in zip(*pairs, strict=True))
@@ -47,13 +49,13 @@ def _compare(name: str, path: Path) -> str:
     )
 
 
-def verify_singly(path: Path) -> verify.VerifyResult:
+def verify_singly(path: Path) -> verification.VerifyResult:
     """Verifies a log without compiled reading and without the compiled loop."""
     with (
         mock.patch.object(mcap_reader, "_BLOCK_BYTES", 1 << 40),
         mock.patch.object(site_log, "index_records", return_value=None),
     ):
-        return verify.verify(open_log(path))
+        return verification.verify(open_log(path))
 
 
 def _processor_s(call: Callable[[], object]) -> float:

@@ -3,7 +3,7 @@
 import io
 
 from trilat_net.execution import virtual
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance

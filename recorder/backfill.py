@@ -18,12 +18,17 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
-from trilat_net.log.accounting import Account
-from trilat_net.log.log_layout import SITE_CHANNELS
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.requests import BACKFILL_MESSAGES, Backfill, BackfillRequest
-from trilat_net.net.wire import decode, encode
+from trilat_net.log import SITE_CHANNELS, Account
+from trilat_net.net import (
+    BACKFILL_MESSAGES,
+    Backfill,
+    BackfillRequest,
+    Bus,
+    Inbox,
+    decode,
+    encode,
+    topics,
+)
 
 from .site_reception import SiteMessage, SiteReception
 

@@ -21,18 +21,21 @@ from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.errors import LogRefused, RunFailed, SessionError
-from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, MakeViews
-from trilat_net.log.mcap_writer import Sink
-from trilat_net.log.session_scenario import SessionScenario
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection
-from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import Epoch, EventPublisher, describe_member, new_boot
-from trilat_net.net.pinging import describe_clocks
-from trilat_net.net.session import SessionJoin
-from trilat_net.net.zenoh_bus import share_threads
+from trilat_net.log import LogParts, LogStorage, LogWriter, MakeViews, SessionScenario, Sink
+from trilat_net.net import (
+    Bus,
+    Clock,
+    Connection,
+    Epoch,
+    EventPublisher,
+    SessionJoin,
+    connect_to_session,
+    describe_clocks,
+    describe_member,
+    new_boot,
+    share_threads,
+    topics,
+)
 from trilat_net.signals import Interrupt
 
 from .session_recording import RecorderReport, Recording

@@ -19,15 +19,19 @@ from collections import Counter
 from collections.abc import Callable
 
 from trilat_net.errors import WireError, count_nouns
-from trilat_net.log.accounting import LAST, Account
-from trilat_net.log.log_writer import LogParts, LogWriter
-from trilat_net.log.session_scenario import SessionScenario
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.membership import Epoch, EventPublisher
-from trilat_net.net.messages import Event, RecorderStats
-from trilat_net.net.wire import decode, encode, split_states
+from trilat_net.log import LAST, Account, LogParts, LogWriter, SessionScenario
+from trilat_net.net import (
+    Bus,
+    Clock,
+    Epoch,
+    Event,
+    EventPublisher,
+    RecorderStats,
+    decode,
+    encode,
+    split_states,
+    topics,
+)
 
 from .backfill import GapRepair
 from .site_reception import AWAY_NS, InboundQueue, SiteMessage, SiteReception

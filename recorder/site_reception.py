@@ -24,20 +24,20 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError, count_nouns
-from trilat_net.log.accounting import Account, StartGap
-from trilat_net.log.log_layout import CHANNEL_TYPES, SITE_CHANNELS
-from trilat_net.log.session_scenario import SessionScenario
-from trilat_net.net import topics
-from trilat_net.net.clock import Clock
-from trilat_net.net.messages import Event, LinkStats, State
-from trilat_net.net.requests import Backfill
-from trilat_net.net.topics import (
+from trilat_net.log import CHANNEL_TYPES, SITE_CHANNELS, Account, SessionScenario, StartGap
+from trilat_net.net import (
+    Backfill,
+    Clock,
+    Event,
+    LinkStats,
+    State,
     count_messages,
     count_under_way,
+    make_decoder,
     number_message,
     skipped_numbers,
+    topics,
 )
-from trilat_net.net.wire import make_decoder
 from trilat_net.recorded_change import count_skipped_ticks
 
 AWAY_NS = 15_000_000_000

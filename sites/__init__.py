@@ -5,3 +5,34 @@ the other sites, runs the control loop of its arm at a fixed rate, exchanges the
 arm with the other sites in every period, and leaves at the end. The package also contains the
 programs around a session, such as those that start it, move an arm, or measure the network.
 """
+
+from typing import TYPE_CHECKING
+
+from trilat_net.hooks import import_on_use
+
+__all__ = [
+    "SiteOptions",
+    "check_machine_load",
+    "rehearse_loop",
+    "run_hand",
+    "run_site",
+    "warm_up",
+]
+
+if TYPE_CHECKING:
+    from .hand_process import run_hand
+    from .loop_rehearsal import rehearse_loop
+    from .machine_load import check_machine_load
+    from .site_parts import SiteOptions, warm_up
+    from .site_process import run_site
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "hand_process": "run_hand",
+            "loop_rehearsal": "rehearse_loop",
+            "machine_load": "check_machine_load",
+            "site_parts": "SiteOptions warm_up",
+            "site_process": "run_site",
+        },
+    )

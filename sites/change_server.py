@@ -27,21 +27,27 @@ from contextlib import suppress
 import msgspec
 from msgspec import UNSET
 
-from trilat_net.core.step.site_arrays import MAX_CHANGES, MAX_RAMPS
-from trilat_net.core.step.ticks import CoreChange, Mode, first_tick_at, tick_ns
+from trilat_net.core import MAX_CHANGES, MAX_RAMPS, CoreChange, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
-from trilat_net.net.bus import Query, QueryInbox
-from trilat_net.net.messages import MODE_WORDS
-from trilat_net.net.requests import ChangeReply, ChangeRequest
-from trilat_net.net.wire import decode, encode
-from trilat_net.scenario import Scenario, find_owner
-from trilat_net.scenario.run_changes import (
+from trilat_net.net import (
+    MODE_WORDS,
+    ChangeReply,
+    ChangeRequest,
+    Query,
+    QueryInbox,
+    decode,
+    encode,
+)
+from trilat_net.recorded_change import SiteOrder
+from trilat_net.records import Mode
+from trilat_net.scenario import (
     LinkTables,
+    Scenario,
+    find_owner,
     make_site_order,
     resolve_change,
     to_core_change,
 )
-from trilat_net.scenario.scenario_types import SiteOrder
 
 AHEAD_MS = 100
 """Time from the acceptance of a change until it takes effect, in ms."""

@@ -22,9 +22,9 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, TypeVar
 
-from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import count_nouns
-from trilat_net.net.clock import Clock
+from trilat_net.net import Clock
+from trilat_net.records import NS_PER_S
 
 try:
     import resource

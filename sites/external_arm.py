@@ -22,15 +22,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import RELEASE_REASONS, LifeReason, Mode, PlantState
+from trilat_net.core import RELEASE_REASONS, LifeReason, PlantState, Site
 from trilat_net.errors import SessionError, WireError
 from trilat_net.files import find_page
-from trilat_net.net.bus import StampedInbox
-from trilat_net.net.clock import Clock
-from trilat_net.net.requests import ArmEnable, ArmMeasurement
-from trilat_net.net.wire import decode
-from trilat_net.scenario.scenario_types import SiteOrder
+from trilat_net.net import ArmEnable, ArmMeasurement, Clock, StampedInbox, decode
+from trilat_net.recorded_change import SiteOrder
+from trilat_net.records import Mode
 
 from .site_loop import STEP_MARGIN_RAD
 

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.life.own_hand import HandProgram, HandView
-from trilat_net.core.plug.user_law import PeerView
+from trilat_net.core import HandProgram, HandView, PeerView
 from trilat_net.errors import (
     RunFailed,
     SessionError,
@@ -29,19 +28,19 @@ from trilat_net.errors import (
     count_nouns,
     describe_exception,
 )
-from trilat_net.net import topics
-from trilat_net.net.arm_client import SiteClient, make_hand_sender
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection, open_bus
-from trilat_net.net.membership import read_messages
-from trilat_net.net.requests import HandMessage, HandViewMessage
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.program_hand import (
-    HandSite,
-    find_own_hand,
-    make_hand_program,
+from trilat_net.net import (
+    Bus,
+    Clock,
+    Connection,
+    HandMessage,
+    HandViewMessage,
+    SiteClient,
+    SiteSender,
+    SystemClock,
+    read_messages,
+    topics,
 )
+from trilat_net.scenario import HandSite, Scenario, make_hand_program
 from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
@@ -85,7 +84,7 @@ class HandProcess(SiteClient):
         site_rate_hz = hand_site.scenario.sites[hand_site.name].rate_hz
         self._ticks_per_view = site_rate_hz // hand_site.rate_hz
 
-        self._sender = make_hand_sender(bus, clock, session, hand_site.name)
+        self._sender = SiteSender.for_hand(bus, clock, session, hand_site.name)
         self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), _VIEWS_KEPT)
         self._announced_ns = 0
         self._waiting_views = deque[HandViewMessage]()
@@ -211,7 +210,7 @@ def run_hand(
         SessionError: The site does not send its state in time.
         RunFailed: The class failed.
     """
-    hand_site = find_own_hand(scenario, name)
+    hand_site = HandSite.find(scenario, name)
     if hand_site is None or not hand_site.has_separate_process:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(
@@ -223,9 +222,7 @@ def run_hand(
     clock = SystemClock()
     stopped = interrupt.is_requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-    bus = open_bus(
-        connection=connection, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
-    )
+    bus = connection.open_bus(clock=clock, stopped=stopped, timeout_s=timeout_s, say=say)
     if bus is None:
         return
 

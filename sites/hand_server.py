@@ -20,24 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.life.live_hand import (
+from trilat_net.core import (
     HandCommand,
     HandMemory,
+    MotionLimits,
+    Site,
+    SiteArrays,
     advance_hand,
     empty_hand_vector,
+    tick_ns,
 )
-from trilat_net.core.step.site_arrays import SiteArrays
-from trilat_net.core.step.site_setup import MotionLimits
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import tick_ns
 from trilat_net.errors import SessionError, WireError, count_nouns
-from trilat_net.net.bus import Inbox
-from trilat_net.net.clock import Clock
-from trilat_net.net.requests import HandMessage, HandViewMessage, PeerSeen
-from trilat_net.net.wire import decode, encode
-from trilat_net.scenario.arms import ArmModel
-from trilat_net.scenario.operators.kernel_operators import LiveHand
-from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
+from trilat_net.net import Clock, HandMessage, HandViewMessage, Inbox, PeerSeen, decode, encode
+from trilat_net.scenario import ArmModel, HandPlayer, HandSite, LiveHand
 
 MESSAGES_KEPT = 32
 """Number of messages in the queue, and largest number of messages that a tick reads.

@@ -6,10 +6,9 @@ due. The loop does the same work as in a session, except that no messages are ex
 
 from collections.abc import Sequence
 
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import NS_PER_S, Arrival, TickInput, TickRecord
-from trilat_net.net.clock import Clock
-from trilat_net.net.timing import LoopStats, SiteTiming
+from trilat_net.core import Site, TickInput
+from trilat_net.net import Clock, LoopStats, SiteTiming
+from trilat_net.records import NS_PER_S, Arrival, TickRecord
 from trilat_net.scenario import Scenario
 
 from .site_loop import PeerInbox, StateBlock, run_loop

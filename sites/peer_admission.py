@@ -11,10 +11,9 @@ Invariant:
 
 from msgspec.structs import asdict
 
-from trilat_net.core.step.ticks import NS_PER_S, tick_ns
-from trilat_net.net.membership import Epoch, EventPublisher
-from trilat_net.net.messages import Event
-from trilat_net.net.timing import SiteTiming
+from trilat_net.core import tick_ns
+from trilat_net.net import Epoch, Event, EventPublisher, SiteTiming
+from trilat_net.records import NS_PER_S
 
 from .site_loop import PeerInbox
 from .site_news import publish_clocks

@@ -19,10 +19,7 @@ Invariant:
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeVar
 
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.membership import EventPublisher, read_messages
-from trilat_net.net.messages import Event
+from trilat_net.net import Bus, Event, EventPublisher, Inbox, read_messages, topics
 
 T = TypeVar("T")
 

@@ -13,13 +13,19 @@ Invariant (law L6 of docs/develop/design.md):
 
 from array import array
 
-from trilat_net.core.step.site_setup import Layout
-from trilat_net.core.step.site_step import Site
-from trilat_net.net import topics
-from trilat_net.net.bus import QueryInbox
-from trilat_net.net.pinging import answer_backfill
-from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
-from trilat_net.net.topics import STATS_PER_SECOND, count_messages, skipped_numbers
+from trilat_net.core import Site
+from trilat_net.net import (
+    BACKFILL_BYTES,
+    BACKFILL_MESSAGES,
+    STATS_PER_SECOND,
+    BackfillRequest,
+    QueryInbox,
+    answer_backfill,
+    count_messages,
+    skipped_numbers,
+    topics,
+)
+from trilat_net.records import Layout
 
 KEPT_S = 60
 """Time for which messages are stored, in s."""

@@ -11,14 +11,22 @@ Invariant:
 
 from collections.abc import Sequence
 
-from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord, tick_ns
+from trilat_net.core import TickInput, tick_ns
 from trilat_net.errors import CodeFailed, RunFailed
-from trilat_net.net.known_sites import make_site_known
-from trilat_net.net.membership import Epoch, EventPublisher
-from trilat_net.net.pinging import Pinger, describe_clocks
-from trilat_net.net.requests import ChangeRequest
-from trilat_net.net.timing import LinkTimingMonitor, PeerClock, SiteTiming, find_turn_ns
-from trilat_net.net.wire import encode
+from trilat_net.net import (
+    ChangeRequest,
+    Epoch,
+    EventPublisher,
+    LinkTimingMonitor,
+    PeerClock,
+    Pinger,
+    SiteTiming,
+    describe_clocks,
+    encode,
+    find_turn_ns,
+    make_site_known,
+)
+from trilat_net.records import Arrival, TickRecord
 
 from . import realtime
 from .peer_admission import PeerAdmission

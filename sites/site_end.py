@@ -12,11 +12,10 @@ import signal
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from trilat_net.core.step.ticks import NS_PER_S, Mode, TickRecord, describe_divergence
+from trilat_net.core import describe_divergence
 from trilat_net.errors import PeerLeft, RunFailed, count_nouns
-from trilat_net.net import topics
-from trilat_net.net.membership import EventPublisher
-from trilat_net.net.timing import LinkTimingMonitor
+from trilat_net.net import EventPublisher, LinkTimingMonitor, topics
+from trilat_net.records import NS_PER_S, Mode, TickRecord
 
 from .site_parts import SiteParts
 

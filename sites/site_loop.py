@@ -25,25 +25,30 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
 
-from trilat_net.core.life.live_hand import HandInForce
-from trilat_net.core.links.delay import DelayKind
-from trilat_net.core.links.link import AHEAD_LIMIT_NS
-from trilat_net.core.step.site_setup import LinkSetup, SiteSetup
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import (
+from trilat_net.core import (
+    AHEAD_LIMIT_NS,
     MAX_ARRIVALS,
-    NS_PER_S,
-    Arrival,
-    Mode,
-    TickRecord,
+    DelayKind,
+    HandInForce,
+    LinkSetup,
+    Site,
+    SiteSetup,
     first_tick_at,
 )
 from trilat_net.errors import WireError
-from trilat_net.net.bus import StampedInbox
-from trilat_net.net.clock import Clock
-from trilat_net.net.messages import PeerSample
-from trilat_net.net.timing import LinkTimingMonitor, LoopStats, SiteTiming
-from trilat_net.net.wire import encode, encode_sample, encode_state, make_reader
+from trilat_net.net import (
+    Clock,
+    LinkTimingMonitor,
+    LoopStats,
+    PeerSample,
+    SiteTiming,
+    StampedInbox,
+    encode,
+    encode_sample,
+    encode_state,
+    make_reader,
+)
+from trilat_net.records import NS_PER_S, Arrival, Mode, TickRecord
 from trilat_net.scenario import Scenario
 
 

@@ -14,25 +14,20 @@ from collections.abc import Iterable, Sequence
 import msgspec
 import numpy as np
 
-from trilat_net.core.step.site_setup import StaleAction
-from trilat_net.core.step.ticks import (
-    NS_PER_S,
+from trilat_net.core import (
+    LifeAlarm,
     LifeReason,
-    Mode,
-    TickRecord,
+    StaleAction,
     describe_mode,
-    find_alarm,
     find_life_reason,
     tick_ns,
 )
 from trilat_net.errors import count_nouns
-from trilat_net.log.site_log import compute_task_errors
-from trilat_net.net.membership import EventPublisher
-from trilat_net.net.messages import MODE_WORDS
-from trilat_net.net.timing import ClockNotice
+from trilat_net.log import compute_task_errors
+from trilat_net.net import MODE_WORDS, ClockNotice, EventPublisher
 from trilat_net.recorded_change import count_skipped_ticks
-from trilat_net.scenario.run_changes import describe_change
-from trilat_net.scenario.scenario_types import Change
+from trilat_net.records import NS_PER_S, Mode, TickRecord
+from trilat_net.scenario import Change, describe_change
 
 from .site_parts import SiteParts
 
@@ -140,7 +135,7 @@ class SiteNews:
         if rule.degrades and mode is Mode.RETURN:
             lost_peers = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
 
-        alarm = find_alarm(
+        alarm = LifeAlarm.find(
             session=parts.options.session,
             site=parts.name,
             mode=MODE_WORDS[mode],

@@ -15,38 +15,45 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from trilat_net.core.step.site_setup import SiteSetup
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import (
-    Arrival,
+from trilat_net.core import (
     CoreChange,
     PlantState,
+    Site,
+    SiteSetup,
     TickInput,
-    TickRecord,
     first_tick_at,
     tick_ns,
 )
 from trilat_net.errors import LawFailed
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection
-from trilat_net.net.membership import new_boot
-from trilat_net.net.messages import PeerSample
-from trilat_net.net.offset import OffsetEstimator, OffsetLimit
-from trilat_net.net.timing import LoopStats
-from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
-from trilat_net.own_code.imported_code import ImportedLaw
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.program_hand import (
-    HandPlayer,
-    find_own_hand,
-    make_hand_program,
+from trilat_net.net import (
+    Bus,
+    Clock,
+    Connection,
+    LoopStats,
+    OffsetEstimator,
+    OffsetLimit,
+    PeerSample,
+    SystemClock,
+    decode,
+    encode_sample,
+    encode_state,
+    join_states,
+    new_boot,
+    topics,
 )
-from trilat_net.scenario.own_plant import OwnPlant
-from trilat_net.scenario.plant_player import PlantPlayer
-from trilat_net.scenario.run_changes import make_site_order, to_core_change
-from trilat_net.scenario.scenario_types import SiteOrder
+from trilat_net.own_code import ImportedLaw
+from trilat_net.recorded_change import SiteOrder
+from trilat_net.records import Arrival, TickRecord
+from trilat_net.scenario import (
+    HandPlayer,
+    HandSite,
+    OwnPlant,
+    PlantPlayer,
+    Scenario,
+    make_hand_program,
+    make_site_order,
+    to_core_change,
+)
 from trilat_net.signals import Interrupt
 
 from .change_server import ChangeServer
@@ -251,7 +258,7 @@ class SiteParts:
         if live_hand is None:
             return
 
-        own_hand = find_own_hand(self.scenario, name)
+        own_hand = HandSite.find(self.scenario, name)
         if own_hand is not None and not own_hand.has_separate_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
             self.hand = HandPlayer(own_hand, make_hand_program(own_hand), run_hand)

@@ -17,19 +17,19 @@ from collections.abc import Callable
 from contextlib import closing
 
 from sites.line_printer import LinePrinter
-from trilat_net.core.step.fingerprint import compute_fingerprint
-from trilat_net.core.step.ticks import (
-    NS_PER_S,
-)
+from trilat_net.core import compute_fingerprint
 from trilat_net.errors import SessionError
-from trilat_net.net import topics
-from trilat_net.net.clock import make_system_clock
-from trilat_net.net.connection import open_bus
-from trilat_net.net.membership import EventPublisher, LateSites, describe_member
-from trilat_net.net.session import SessionJoin
-from trilat_net.net.zenoh_bus import share_threads
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.validate import check_outside_arms
+from trilat_net.net import (
+    EventPublisher,
+    LateSites,
+    SessionJoin,
+    describe_member,
+    make_system_clock,
+    share_threads,
+    topics,
+)
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Scenario, check_outside_arms
 from trilat_net.signals import Interrupt
 
 from .external_arm import ExternalArm
@@ -76,8 +76,7 @@ def run_site(
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
 
-        bus = open_bus(
-            connection=options.connection,
+        bus = options.connection.open_bus(
             clock=clock,
             stopped=interrupt.is_requested,
             timeout_s=options.join_timeout_s,

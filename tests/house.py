@@ -21,6 +21,20 @@ BELOW_ALL = {
 }
 
 
+INTERFACES = (
+    "trilat_net.log.ros2",
+    *("trilat_net.core", "trilat_net.laws", "trilat_net.own_code", "trilat_net.scenario"),
+    *("trilat_net.net", "trilat_net.log", "trilat_net.execution", "trilat_net.analysis"),
+    *("trilat_net.presentation", "trilat_net.work", "trilat_net.app", "sites", "recorder"),
+)
+"""The packages whose `__init__.py` lists in `__all__` what other packages may import.
+
+A package within another one stands before it.
+"""
+_APP_ROOTS = ("trilat_net", "trilat_net.__main__", "trilat_net.extension")
+"""Modules beside the packages that belong to the app."""
+
+
 def files() -> list[Path]:
     """Returns every source file, tests aside."""
     folders = [parent / top for top, parent in TOPS.items()]
@@ -53,8 +67,87 @@ def room(path: Path) -> str:
     return below[1] if tuple(below[:2]) in INNER_ROOMS else below[0]
 
 
+def find_package(module: str) -> str | None:
+    """Returns the package with an interface to which a module belongs. None if there is none."""
+    return next((name for name in INTERFACES if f"{module}.".startswith(f"{name}.")), None)
+
+
+def find_border(module: str) -> str:
+    """Returns the package whose modules a module may import without their interface."""
+    if module in _APP_ROOTS:
+        return "trilat_net.app"
+    return find_package(module) or module.partition(".")[0]
+
+
+def package_folder(package: str) -> Path:
+    """Returns the folder of a package."""
+    return TOPS[package.partition(".")[0]].joinpath(*package.split("."))
+
+
+def list_interface(package: str) -> list[str]:
+    """Returns the names in `__all__` of a package."""
+    for node in tree(package_folder(package) / "__init__.py").body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            names: list[str] = ast.literal_eval(node.value)
+            return names
+    return []
+
+
+@cache
+def interface_homes(package: str) -> dict[str, str]:
+    """Returns the module of each name of an interface, relative to the package.
+
+    The module of a name that is itself a module is that module.
+    """
+    path = package_folder(package) / "__init__.py"
+    homes = {}
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.ImportFrom) and node.level == 1:
+            for alias in node.names:
+                inside = ".".join(filter(None, (node.module, alias.name)))
+                is_module = find_file((*package.split("."), *inside.split("."))) is not None
+                homes[alias.name] = inside if is_module else node.module or ""
+    return homes
+
+
+def assigned_names(path: Path) -> set[str]:
+    """Returns the names that the statements at the top of a file define."""
+    names = {name for name in definitions(path) if "." not in name}
+    for node in tree(path).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {
+                inner.id
+                for target in targets
+                for inner in ast.walk(target)
+                if isinstance(inner, ast.Name)
+            }
+    return names
+
+
+def find_file(module: tuple[str, ...]) -> Path | None:
+    """Returns the file of a module of the program. None if the module is not of the program."""
+    return _module(TOPS[module[0]].joinpath(*module)) if module and module[0] in TOPS else None
+
+
 def imported_names(path: Path) -> Iterator[tuple[str, ...]]:
-    """Yields what a file imports, wherever in it the import stands, as the parts of a dotted name."""
+    """Yields what a file imports, wherever in it the import stands, as the parts of a dotted name.
+
+    A name that the file imports from an interface is that of the module which defines it.
+    """
+    for parts in written_imports(path):
+        package = ".".join(parts[:-1])
+        home = interface_homes(package).get(parts[-1]) if package in INTERFACES else None
+        if home is None:
+            yield parts
+        elif home.rpartition(".")[2] == parts[-1]:
+            yield (*parts[:-1], *home.split("."))
+        else:
+            yield (*parts[:-1], *home.split("."), parts[-1])
+
+
+def written_imports(path: Path) -> Iterator[tuple[str, ...]]:
+    """Yields what a file imports, as `imported_names` does, with the modules that the file names."""
     package = _dotted_parts(path)[:-1]
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.ImportFrom):
@@ -68,12 +161,9 @@ def imported_names(path: Path) -> Iterator[tuple[str, ...]]:
 def _imported(path: Path) -> Iterator[Path]:
     """Yields the files of this program that a file imports."""
     for name in imported_names(path):
-        for parts in (name, name[:-1]):
-            if not parts or parts[0] not in TOPS:
-                continue
-            if (found := _module(TOPS[parts[0]].joinpath(*parts))) is not None:
-                yield found
-                break
+        found = find_file(name) or find_file(name[:-1])
+        if found is not None:
+            yield found
 
 
 def _module(at: Path) -> Path | None:
@@ -83,8 +173,9 @@ def _module(at: Path) -> Path | None:
 
 
 def room_imports() -> set[tuple[str, str]]:
-    """Returns which room imports which; those that lie below all others are left out."""
-    pairs = {(room(path), room(other)) for path in files() for other in _imported(path)}
+    """Returns which room imports which, without rooms below all others, and interfaces."""
+    paths = [path for path in files() if dotted(path) not in INTERFACES]
+    pairs = {(room(path), room(other)) for path in paths for other in _imported(path)}
     return {
         (a, b)
         for a, b in pairs
@@ -119,7 +210,7 @@ def layers() -> dict[str, int]:
     }
 
 
-def _dotted(path: Path) -> str:
+def dotted(path: Path) -> str:
     return ".".join(_dotted_parts(path)).removesuffix(".__init__")
 
 
@@ -128,7 +219,7 @@ def heights() -> dict[str, int]:
     """Returns the height of the layer of each module, by its dotted name; some belong to no layer."""
     levels = {}
     for path in files():
-        parts = _dotted(path).split(".")
+        parts = dotted(path).split(".")
         names = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
         layer = next((name for name in names if name in layers()), None)
         if layer is not None:
@@ -141,7 +232,7 @@ def class_heights() -> dict[str, int]:
     """Returns the height of the lowest layer that defines a class, by the name of the class."""
     levels: dict[str, int] = {}
     for path in files():
-        height = heights().get(_dotted(path))
+        height = heights().get(dotted(path))
         for node in tree(path).body:
             if isinstance(node, ast.ClassDef) and height is not None:
                 levels[node.name] = min(height, levels.get(node.name, height))
@@ -165,7 +256,7 @@ def names_from_above(path: Path) -> set[str]:
 
     A module is named by its dotted name, or by the end of one, as in f"{__package__}.analysis.judge".
     """
-    height = heights().get(_dotted(path))
+    height = heights().get(dotted(path))
     if height is None:
         return set()
     names = set()

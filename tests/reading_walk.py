@@ -23,6 +23,7 @@ annotations of arguments, fields and results. Expressions of unknown class are n
 """
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -76,7 +77,16 @@ def _module_names(path: Path) -> dict[str, Place | Path | ast.expr]:
             names[node.targets[0].id] = node.value
         elif isinstance(node, ast.ImportFrom) and node.level:
             base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+            package = ".".join(base.relative_to(house.ROOT).parts)
+            homes = house.interface_homes(package) if package in house.INTERFACES else {}
             for alias in node.names:
+                if alias.name in homes:
+                    home = house.find_file((*package.split("."), *homes[alias.name].split(".")))
+                    if home is not None:
+                        is_module = home.stem == alias.name
+                        place = home if is_module else Place(home, alias.name)
+                        names[alias.asname or alias.name] = place
+                    continue
                 inside = (base / alias.name).with_suffix(".py")
                 module = base.with_suffix(".py")
                 if module.is_file() or inside.is_file():
@@ -104,7 +114,8 @@ def _names_in(node: ast.AST) -> Iterator[str]:
         if isinstance(below, ast.Name):
             yield below.id
         elif isinstance(below, ast.Constant) and isinstance(below.value, str):
-            yield below.value
+            # an annotation in quotes, as a class method of a result has
+            yield from re.findall(r"\w+", below.value)
 
 
 def _resolve(path: Path, name: str) -> list[Place]:

@@ -52,7 +52,7 @@ from trilat_net.core.life import live_hand, session_life
 from trilat_net.core.links import delay, link
 from trilat_net.core.plug import user_law
 from trilat_net.core.step import site_arrays, ticks
-from trilat_net.execution import twins, verify
+from trilat_net.execution import twins, verification
 from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
@@ -311,7 +311,7 @@ STATED: list[tuple[str, str, float, float]] = [
         65_536,
         site_log.MAX_DECODED_RECORDS,
     ),
-    ("verify.md", "agree to 1e-9 (1 + |a|)", 1e-9, verify.TOLERANCE),
+    ("verify.md", "agree to 1e-9 (1 + |a|)", 1e-9, verification.TOLERANCE),
     ("replay.md", "sleeps until 150 us before", 150, player.SPIN_NS / 1e3),
     ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
     ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),

@@ -24,7 +24,7 @@ from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.app.running_session import open_hand
-from trilat_net.log.ros2.topic_names import read_topic_table
+from trilat_net.log.ros2.topic_names import TopicTable
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
@@ -197,7 +197,7 @@ def test_six_joint_robot_follows_a_push() -> None:
 )
 def test_robot_file_fits_its_scenario(example: str, file: str) -> None:
     scenario = trilat_net.load_scenario(LOOK.with_name(example))
-    table = read_topic_table(str(LOOK.with_name(file)))
+    table = TopicTable.read(str(LOOK.with_name(file)))
     robot = table.robots["s"]
     refuse_other_robots(table, scenario)
     joints = len(scenario.sites["s"].q0_rad)

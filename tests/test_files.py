@@ -17,22 +17,21 @@ from tests import house
 from tests.install_extras import list_extras, parse_extras
 from tests.other_systems import replace_os
 from trilat_net import files
+from trilat_net.app.api import choose_report_folder
+from trilat_net.app.demo_session import create_file
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
-    choose_report_folder,
-    create_file,
-    extend_file,
     format_extra_install,
     make_results_folder,
     make_subfolder,
     open_regular,
     refuse_existing,
     stage_output,
-    sync_folder,
     write_whole,
 )
-from trilat_net.log.log_file import LogFile
+from trilat_net.log.log_file import LogFile, sync_folder
 from trilat_net.presentation.export import EXPORT_MANIFEST
+from trilat_net.work.study_folder import extend_file
 
 
 def everything(folder: Path) -> dict[str, str]:

@@ -3,6 +3,7 @@
 import csv
 import re
 from collections import Counter, defaultdict
+from importlib import import_module
 
 import grimp
 import pytest
@@ -12,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from trilat_net.hooks import find_hook, list_hooks
 
 from . import house, line_figures, part_interfaces, reading_walk
+from .import_contracts import see_through_interfaces
 
 ARM_STAGES = ("trilat_net/core/arms/chain_stages.py", "trilat_net/core/arms/two_link_stages.py")
 PLUG_INS = {
@@ -48,13 +50,13 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 329,
-    "session": 296,
-    "analysis": 120,
-    "app": 68,
+    "kernel": 316,
+    "session": 277,
+    "analysis": 109,
+    "app": 60,
     "studies": 9,
     "people": 9,
-    "ros2": 28,
+    "ros2": 27,
 }
 """A number here only falls; `python -m tests.part_interfaces --count` prints them."""
 TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
@@ -164,9 +166,38 @@ def test_every_import_between_rooms_has_its_reason() -> None:
 
 
 @pytest.mark.push
-def test_every_name_that_another_part_uses_is_listed() -> None:
-    """`python -m tests.part_interfaces` writes the table; its change shows what a part gives to others."""
-    assert part_interfaces.read_table() == part_interfaces.list_interfaces()
+def test_other_packages_import_names_of_the_interface_alone() -> None:
+    """Everything else inside a package may change freely (docs/develop/packages.md)."""
+    imports = part_interfaces.list_crossing_imports()
+    assert len(imports) > 1000
+    assert [
+        (str(crossing.file), crossing.module, crossing.name)
+        for crossing in imports
+        if crossing.module != crossing.package
+        or crossing.name not in house.list_interface(crossing.package)
+    ] == []
+
+
+@pytest.mark.push
+def test_other_packages_use_every_name_of_an_interface() -> None:
+    """A name that no other package imports any more leaves `__all__`."""
+    assert part_interfaces.list_unused_names() == {}
+
+
+@pytest.mark.push
+@pytest.mark.parametrize("package", house.INTERFACES)
+def test_interfaces_resolve_the_names_that_they_list(package: str) -> None:
+    """`python -m tests.part_interfaces` writes the tables below `__all__`."""
+    interface = import_module(package)
+    homes = house.interface_homes(package)
+    assert sorted(homes) == sorted(house.list_interface(package))
+    assert homes == part_interfaces.find_homes(package)
+    for name, home in homes.items():
+        module = import_module(f"{package}.{home}")
+        value = module if home.endswith(f".{name}") or home == name else vars(module)[name]
+        assert getattr(interface, name) is value
+    with pytest.raises(AttributeError, match="has no attribute 'no_such_name'"):
+        _ = interface.no_such_name
 
 
 @pytest.mark.push
@@ -196,6 +227,7 @@ def test_every_hook_that_is_looked_up_is_registered() -> None:
 @pytest.mark.push
 def test_no_modules_import_each_other_in_circles() -> None:
     graph = grimp.build_graph(*house.TOPS, cache_dir=None, exclude_type_checking_imports=True)
+    see_through_interfaces(graph)
     modules = sorted(graph.modules)
     indices = {module: n for n, module in enumerate(modules)}
     imports = lil_matrix((len(modules), len(modules)), dtype=bool)
@@ -207,6 +239,19 @@ def test_no_modules_import_each_other_in_circles() -> None:
     for module, circle in zip(modules, circles, strict=True):
         members[circle].append(module)
     assert [names for names in members.values() if len(names) > 1] == []
+
+
+@pytest.mark.push
+def test_contracts_see_the_modules_behind_interfaces() -> None:
+    graph = grimp.build_graph(*house.TOPS, cache_dir=None)
+    see_through_interfaces(graph)
+    assert graph.direct_import_exists(
+        importer="sites.site_process", imported="trilat_net.net.zenoh_bus"
+    )
+    assert graph.find_modules_directly_imported_by("trilat_net.net") == {"trilat_net.hooks"}
+    assert not graph.chain_exists(
+        importer="recorder", imported="trilat_net.core", as_packages=True
+    )
 
 
 def test_the_tour_names_existing_files() -> None:

@@ -58,8 +58,8 @@ if _TYPE_CHECKING:
     from trilat_net.app.running_session import session as session
     from trilat_net.app.running_session import start as start
 
-    from .analysis.file_overview import info as info
-    from .analysis.twins.twin_growth import twin as twin
+    from .analysis import info as info
+    from .analysis import twin as twin
     from .app.api import certify as certify
     from .app.api import export as export
     from .app.api import linear as linear
@@ -68,37 +68,37 @@ if _TYPE_CHECKING:
     from .app.api import simulate as simulate
     from .app.api import verify as verify
     from .app.api import view as view
-    from .core.life.own_hand import HandContext as HandContext
-    from .core.life.own_hand import HandView as HandView
-    from .core.plug.compiled_law import compiled as compiled
-    from .core.plug.user_law import LawContext as LawContext
-    from .core.plug.user_law import LawInput as LawInput
-    from .execution.rerun import rerun as rerun
-    from .log.log_reader import open_log as open_log
-    from .log.log_signature import create_signing_keys as create_signing_keys
-    from .log.log_signature import sign_log as sign_log
-    from .log.orientations import expand_poses as expand_poses
-    from .log.recover import recover as recover
-    from .log.session_check import check_file as check_file
-    from .net.arm_client import ArmClient as ArmClient
-    from .net.arm_client import SwitchClient as SwitchClient
-    from .net.member_keys import add_keys as add_keys
-    from .net.member_keys import create_keys as create_keys
-    from .net.member_keys import read_member_keys as read_member_keys
-    from .net.member_keys import renew_keys as renew_keys
-    from .presentation.figures.registry import figure as figure
+    from .core import HandContext as HandContext
+    from .core import HandView as HandView
+    from .core import LawContext as LawContext
+    from .core import LawInput as LawInput
+    from .core import compiled as compiled
+    from .execution import rerun as rerun
+    from .log import check_file as check_file
+    from .log import create_signing_keys as create_signing_keys
+    from .log import expand_poses as expand_poses
+    from .log import open_log as open_log
+    from .log import recover as recover
+    from .log import sign_log as sign_log
+    from .net import ArmClient as ArmClient
+    from .net import SwitchClient as SwitchClient
+    from .net import add_keys as add_keys
+    from .net import create_keys as create_keys
+    from .net import read_member_keys as read_member_keys
+    from .net import renew_keys as renew_keys
+    from .presentation import figure as figure
     from .process import request_real_time_scheduling as request_real_time_scheduling
+    from .scenario import PlantContext as PlantContext
     from .scenario import Scenario as Scenario
+    from .scenario import SimulatedArm as SimulatedArm
+    from .scenario import describe_scenario as describe_scenario
+    from .scenario import import_trace as import_trace
     from .scenario import list_shipped as list_shipped
     from .scenario import load_scenario as load_scenario
+    from .scenario import new_hand as new_hand
+    from .scenario import new_law as new_law
+    from .scenario import new_plant as new_plant
     from .scenario import read_template as read_template
-    from .scenario.delay_traces import import_trace as import_trace
-    from .scenario.describe import describe_scenario as describe_scenario
-    from .scenario.plant_player import PlantContext as PlantContext
-    from .scenario.simulated_arm import SimulatedArm as SimulatedArm
-    from .scenario.skeletons import new_hand as new_hand
-    from .scenario.skeletons import new_law as new_law
-    from .scenario.skeletons import new_plant as new_plant
 
     __version__: str
 
@@ -108,32 +108,24 @@ _NAMES = {
     "trilat_net.app.input_device": "Device DeviceState",
     "trilat_net.app.network_benchmark": "ping_benchmark",
     "trilat_net.app.running_session": "hand session start",
-    "trilat_net.analysis.file_overview": "info",
-    "trilat_net.analysis.twins.twin_growth": "twin",
     "trilat_net.app.api": "certify export linear metrics report simulate verify view",
-    "trilat_net.core.plug.compiled_law": "compiled",
-    "trilat_net.core.life.own_hand": "HandContext HandView",
-    "trilat_net.core.plug.user_law": "LawContext LawInput",
-    "trilat_net.execution.rerun": "rerun",
-    "trilat_net.log.log_reader": "open_log",
-    "trilat_net.log.log_signature": "create_signing_keys sign_log",
-    "trilat_net.log.orientations": "expand_poses",
-    "trilat_net.log.recover": "recover",
-    "trilat_net.log.session_check": "check_file",
-    "trilat_net.net.arm_client": "ArmClient SwitchClient",
-    "trilat_net.net.member_keys": "add_keys create_keys read_member_keys renew_keys",
+    "trilat_net.analysis": "info twin",
+    "trilat_net.core": "HandContext HandView LawContext LawInput compiled",
+    "trilat_net.execution": "rerun",
+    "trilat_net.log": "check_file create_signing_keys expand_poses open_log recover sign_log",
+    "trilat_net.net": (
+        "ArmClient SwitchClient add_keys create_keys read_member_keys renew_keys"
+    ),
     "trilat_net.process": "request_real_time_scheduling",
-    "trilat_net.presentation.figures.registry": "figure",
-    "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
-    "trilat_net.scenario.describe": "describe_scenario",
-    "trilat_net.scenario.delay_traces": "import_trace",
-    "trilat_net.scenario.plant_player": "PlantContext",
-    "trilat_net.scenario.simulated_arm": "SimulatedArm",
-    "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
+    "trilat_net.presentation": "figure",
+    "trilat_net.scenario": (
+        "PlantContext Scenario SimulatedArm describe_scenario import_trace list_shipped "
+        "load_scenario new_hand new_law new_plant read_template"
+    ),
 }
-"""The public names that each module defines, separated by spaces."""
+"""The public names that each module or interface has, separated by spaces."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-"""For each public name the module that defines it."""
+"""For each public name the module or interface that has it."""
 _PACKAGE_NAMES = " ".join(_PACKAGE_FUNCTIONS.values()).split()
 """The public names of packages of their own, such as trilat-studies."""
 __all__ = sorted(["__version__", *_MODULES, *_PACKAGE_NAMES])

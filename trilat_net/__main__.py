@@ -55,7 +55,7 @@ def _run() -> None:
             # ahead of other programs on a busy machine, if permitted
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-        from .net.known_sites import stop_at_once
+        from .net import stop_at_once
 
         remaining_arguments = stop_at_once(sys.argv[2:])
         if isinstance(remaining_arguments, int):
@@ -66,8 +66,8 @@ def _run() -> None:
     match sys.argv[1:]:
         case ["start-processes", number, scenario_file] if number.isdecimal():
             # Loaded once here, these modules need not be loaded in each forked process.
-            from recorder import record_process  # noqa: F401
-            from sites import site_process  # noqa: F401
+            from recorder import record_session  # noqa: F401
+            from sites import run_site  # noqa: F401
             from trilat_net.app import recorded_session  # noqa: F401
             from trilat_net.app.demo_session import run_starter
 

@@ -15,8 +15,7 @@ from .app.cli.options import (
     value,
 )
 from .errors import UsageError
-from .presentation.result_text import TextTable
-from .presentation.terminal_output import print_json, print_line, print_table
+from .presentation import TextTable, print_json, print_line, print_table
 
 __all__ = [
     "JsonOption",

@@ -20,7 +20,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import Meta
 
-from .core.arms.chain import LINK_PARAMETERS, MAX_JOINTS
+from .core import LINK_PARAMETERS
+from .records import MAX_JOINTS
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

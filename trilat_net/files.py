@@ -306,50 +306,6 @@ def make_subfolder(folder: Path) -> Path:
     return make_folder(folder)
 
 
-def create_file(path: Path) -> BinaryIO:
-    """Creates a file for writing without a buffer. An earlier file of that name is deleted.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        UsageError: The path is a symbolic link.
-        OSError: The file cannot be made.
-    """
-    refuse_link(path)
-    path.unlink(missing_ok=True)
-    return path.open("xb", buffering=0)
-
-
-def extend_file(path: Path) -> BinaryIO:
-    """Opens a file for appending without a buffer, and creates it if it does not exist.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        UsageError: The path is a symbolic link.
-        OSError: The file cannot be opened.
-    """
-    refuse_link(path)
-    # A link that appears after the check is refused by this flag, which Windows lacks.
-    no_follow = getattr(os, "O_NOFOLLOW", 0)
-
-    def open_without_following(name: str, flags: int) -> int:
-        return os.open(name, flags | no_follow, 0o666)
-
-    return open(path, "ab", buffering=0, opener=open_without_following)
-
-
-def choose_report_folder(log: Path) -> Path:
-    """Returns the default folder of a log's report, which is named after the log.
-
-    Args:
-        log: File of the log. If its name has no suffix, the folder ends in "-report".
-    """
-    return log.with_suffix("") if log.suffix else log.with_name(f"{log.name}-report")
-
-
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Makes a folder for the results of a command, or uses an existing one.
 
@@ -562,23 +518,6 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
         raise describe_write_error(path, error, remedy) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-
-
-def sync_folder(folder: Path) -> None:
-    """Writes the entries of a folder to the disk, so that its files survive a loss of power.
-
-    Without this, a file may be stored completely, but its name may be lost. Nothing happens on
-    platforms that do not support this.
-
-    Args:
-        folder: The folder.
-    """
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def describe_write_error(

@@ -1,9 +1,14 @@
-"""Lets a lower package call functions of an upper package without naming that package.
+"""Finds functions and classes when they are first used: hooks, and the names of an interface.
+
+A hook lets a lower package call a function of an upper package without naming that package.
 
 A package may import only packages below it. A method of a low package may nevertheless need a
 function from above: the records of a run, for example, can draw themselves with `Log.plot`, and
 drawing is the task of the package `presentation`. The upper package registers such a function
 here under the name of its purpose, and the method looks it up by this name.
+
+The interface of a package is `__all__` in its `__init__.py`. Other packages import its names
+from the package (`import_on_use`).
 
 Invariant:
     - Registering imports nothing. The module of a function is imported when the function is
@@ -50,6 +55,34 @@ def find_hook(hook: str) -> Any:
 def list_hooks() -> list[str]:
     """Returns the names of all hooks for which a function is registered, for the tests."""
     return list(_loaders)
+
+
+def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """Returns the `__getattr__` of a package, which imports a module when it is first needed.
+
+    Importing one name of a package therefore imports one of its modules. If the package
+    imported all of its modules, programs that need few of them would start late, and two
+    packages that need each other's modules could not be imported.
+
+    Args:
+        package: Name of the package, `__name__` in its `__init__.py`.
+        modules: The names of the interface, separated by spaces, by the module that defines
+            them. A name equal to that of its module is the module itself.
+    """
+    homes = {
+        name: f"{package}.{module}"
+        for module, names in modules.items()
+        for name in names.split()
+    }
+
+    def find_name(name: str) -> Any:
+        home = homes.get(name)
+        if home is None:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module = import_module(home)
+        return module if home.endswith(f".{name}") else getattr(module, name)
+
+    return find_name
 
 
 def _import_function(module: str, name: str) -> Any:

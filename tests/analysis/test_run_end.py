@@ -11,10 +11,9 @@ from tests.analysis import logs
 from trilat_net.analysis.run_end import (
     NO_BUCKETS,
     EndBehaviour,
+    RunEnd,
     RunTrace,
     Stability,
-    classify_log_end,
-    classify_run_end,
     reduce_to_buckets,
 )
 from trilat_net.core.step.ticks import BUCKETS_PER_S
@@ -75,7 +74,7 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
     ],
 )
 def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None:
-    run_end = classify_log_end(moving(e, qd))
+    run_end = RunEnd.of_log(moving(e, qd))
     assert run_end.behaviour is motion
     assert says in run_end.text
 
@@ -87,7 +86,7 @@ def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None
 def test_the_p_d_margin_shows_in_60_s(d: float, motion: EndBehaviour) -> None:
     """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
     assert (
-        classify_log_end(
+        RunEnd.of_log(
             trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 50})
         ).behaviour
         is motion
@@ -98,10 +97,10 @@ def test_the_p_d_margin_shows_in_60_s(d: float, motion: EndBehaviour) -> None:
 def test_slow_loops_sustain_what_faster_ones_damp() -> None:
     """`digital` with the paper's gains: about 1 rad/s at 100 Hz, and 200 Hz settles."""
     held = {"scheme": "digital", "link.delay_ms": 0.0}
-    slow = classify_log_end(
+    slow = RunEnd.of_log(
         trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0})
     )
-    fast = classify_log_end(
+    fast = RunEnd.of_log(
         trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0})
     )
     assert slow.stability is not Stability.SETTLED
@@ -112,7 +111,7 @@ def test_slow_loops_sustain_what_faster_ones_damp() -> None:
 
 def test_wall_hammering_shows_only_in_longer_records() -> None:
     short, long = (
-        classify_log_end(trilat_net.simulate("contact", {"rate_hz": 100, "duration_s": s}))
+        RunEnd.of_log(trilat_net.simulate("contact", {"rate_hz": 100, "duration_s": s}))
         for s in (15.0, 30.0)
     )
     assert short.behaviour is EndBehaviour.UNDECIDED
@@ -121,7 +120,7 @@ def test_wall_hammering_shows_only_in_longer_records() -> None:
 
 
 def test_a_site_without_records_leaves_it_undecided() -> None:
-    run_end = classify_log_end(
+    run_end = RunEnd.of_log(
         logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
     )
     assert run_end.behaviour is EndBehaviour.UNDECIDED
@@ -132,11 +131,11 @@ def test_only_times_recorded_by_all_sites_count() -> None:
     torn = logs.rewritten(
         moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300)
     )
-    assert classify_log_end(torn).behaviour is EndBehaviour.UNDECIDED
+    assert RunEnd.of_log(torn).behaviour is EndBehaviour.UNDECIDED
 
 
 def test_a_late_jump_is_undecided() -> None:
-    run_end = classify_log_end(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
+    run_end = RunEnd.of_log(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
     assert run_end.behaviour is EndBehaviour.UNDECIDED
     assert run_end.stability is Stability.OPEN
     assert "record longer" in run_end.text
@@ -144,15 +143,15 @@ def test_a_late_jump_is_undecided() -> None:
 
 def test_short_runs_are_undecided_and_stopped_ones_diverged() -> None:
     short = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 50})
-    assert classify_log_end(short).behaviour is EndBehaviour.UNDECIDED
-    stopped = classify_log_end(logs.diverged())
+    assert RunEnd.of_log(short).behaviour is EndBehaviour.UNDECIDED
+    stopped = RunEnd.of_log(logs.diverged())
     assert stopped.behaviour is EndBehaviour.DIVERGED
     assert stopped.text == f"diverged: {logs.diverged().describe_divergence()}"
 
 
 def test_a_log_without_records_is_undecided() -> None:
     empty = logs.rewritten(still(), lambda _: False)
-    assert classify_log_end(empty).behaviour is EndBehaviour.UNDECIDED
+    assert RunEnd.of_log(empty).behaviour is EndBehaviour.UNDECIDED
 
 
 def test_a_decaying_joint_hides_no_growing_one() -> None:
@@ -164,7 +163,7 @@ def test_a_decaying_joint_hides_no_growing_one() -> None:
         wide = swing(-0.3)(t_s)
         return logs.replaced(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
 
-    run_end = classify_log_end(logs.rewritten(still(), change=changed))
+    run_end = RunEnd.of_log(logs.rewritten(still(), change=changed))
     assert (run_end.behaviour, run_end.where) == (EndBehaviour.GROWS, "s joint 2")
     assert run_end.stability is Stability.NOT_STABLE
 
@@ -187,7 +186,7 @@ def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stabilit
         x = swing(0.2)(state.t_ns * 1e-9)
         return logs.replaced(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
 
-    run_end = classify_log_end(logs.rewritten(log, change=changed))
+    run_end = RunEnd.of_log(logs.rewritten(log, change=changed))
     assert run_end.behaviour is EndBehaviour.GROWS
     assert run_end.stability is stability
 
@@ -214,7 +213,7 @@ def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, say
             state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0]
         )
 
-    run_end = classify_log_end(logs.rewritten(still(), change=changed))
+    run_end = RunEnd.of_log(logs.rewritten(still(), change=changed))
     assert run_end.stability is stability
     assert says in run_end.text
 
@@ -225,7 +224,7 @@ def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, say
 )
 def test_hanging_or_thrown_arms_are_not_stable(pose: list[float], says: str) -> None:
     change = lambda s: logs.replaced(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
-    run_end = classify_log_end(logs.rewritten(still(), change=change))
+    run_end = RunEnd.of_log(logs.rewritten(still(), change=change))
     assert run_end.stability is Stability.OPEN
     assert says in run_end.text
 
@@ -242,7 +241,7 @@ def test_a_driven_joint_does_not_oscillate(wide: float, motion: EndBehaviour) ->
         falls = swing(-0.1, wide)(t_s)
         return logs.replaced(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
 
-    assert classify_log_end(logs.rewritten(still(), change=changed)).behaviour is motion
+    assert RunEnd.of_log(logs.rewritten(still(), change=changed)).behaviour is motion
 
 
 RATE_HZ, SPAN_S = 50, 40.0
@@ -273,7 +272,7 @@ def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
 )
 def test_small_speed_is_rest_only_while_falling(speed, behaviour: EndBehaviour) -> None:
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
-    assert classify_run_end(scenario, trace(speed(T_S))).behaviour is behaviour
+    assert trace(speed(T_S)).classify_end(scenario).behaviour is behaviour
 
 
 @pytest.mark.parametrize(
@@ -288,7 +287,7 @@ def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehavi
     """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
     sinking = trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
-    assert classify_run_end(scenario, sinking).behaviour is behaviour
+    assert sinking.classify_end(scenario).behaviour is behaviour
 
 
 @pytest.mark.parametrize(
@@ -298,6 +297,6 @@ def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehavi
 def test_a_late_change_needs_a_longer_record(at_s: float, stability: Stability) -> None:
     later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
-    run_end = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))
+    run_end = trace(np.exp(-0.5 * T_S)).classify_end(scenario)
     assert run_end.stability is stability
     assert ("the loop changes until 39 s" in run_end.text) is (stability is Stability.OPEN)

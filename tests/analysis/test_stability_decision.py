@@ -13,10 +13,10 @@ from trilat_net.analysis.stability_decision import (
 )
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, RestDeparture, TwinGrowth
-from trilat_net.execution.twins import choose_pushes
+from trilat_net.execution.twins import Push
 from trilat_net.scenario import load_scenario
 
-PUSHES = choose_pushes(load_scenario("two_sites"))
+PUSHES = Push.choose(load_scenario("two_sites"))
 STABLE_ROOTS = LoopRoots("stable", -0.163, True, "this rest: stable, -0.163 /s")
 UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True, "this rest: unstable, +0.0424 /s")
 NO_ROOTS = LoopRoots("", None, False, "this rest: no roots: its code may not run")

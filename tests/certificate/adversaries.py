@@ -31,7 +31,7 @@ from trilat_net.analysis.certificate.premises import find_missing_functionals
 from trilat_net.analysis.judge import judge_virtual_run
 from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
 from trilat_net.analysis.theory.linear_edge import find_contact_growth, find_rightmost_root
-from trilat_net.analysis.theory.operating_point import Equilibrium, derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.core.arms.two_link_arm import JOINTS
 from trilat_net.core.step.ticks import BUCKETS_PER_S, NS_PER_S
 from trilat_net.core.step.vectors import Array
@@ -733,7 +733,7 @@ def _rightmost(scenario: Scenario, at: Equilibrium) -> float | None:
         scenario = load_scenario(scenario, {"duration_s": 4.0})
     try:
         rest = follow_equilibrium(scenario, at)
-        root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
+        root = find_rightmost_root(OperatingConditions.derive(scenario), rest, sampled=True)
     except (ScenarioError, np.linalg.LinAlgError):
         return None
     return None if root is None else root.s.real

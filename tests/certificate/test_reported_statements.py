@@ -16,7 +16,7 @@ from trilat_net.analysis.certificate.observed_energy import (
 )
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.run_end import Stability
-from trilat_net.execution.twins import Push, run_virtual_twins
+from trilat_net.execution.twins import Push, Twins
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
 
@@ -205,7 +205,7 @@ def measure_twin(loop: SampledLoop, duration_s: float) -> Any:
     by = np.zeros((len(loop.names), len(loop.inertia)))
     by[0] = PUSH_RAD
     push = Push("push of a", "q", by, again=False, largest=np.inf)
-    (path,) = run_virtual_twins(write_run(loop, 0.0, duration_s), [push], duration_s).paths
+    (path,) = Twins.of_scenario(write_run(loop, 0.0, duration_s), [push], duration_s).paths
     return path.last[round(20.0 * duration_s) - 1].reshape(by.shape)
 
 

@@ -15,7 +15,7 @@ from tests.log_editing import edited, recorded
 from tests.log_surgery import repacked, taken_apart
 from trilat_net.log.log_reader import open_log
 from trilat_net.presentation import page
-from trilat_net.presentation.conclude import conclude
+from trilat_net.presentation.conclusion import conclude
 
 from .running import trilat
 

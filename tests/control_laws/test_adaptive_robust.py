@@ -19,7 +19,7 @@ from trilat_net.analysis.certificate.energy_balance import (
 from trilat_net.analysis.certificate.energy_terms import compute_dissipation, compute_work
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.linear_loop import linearise_loop
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
@@ -118,7 +118,7 @@ def test_small_motions_see_a_larger_kp() -> None:
     def static(law: str, more: str) -> np.ndarray:
         scenario = parse_scenario(SHAKEN.format(law=law, more=more))
         return linearise_loop(
-            derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3, 0.2))
+            OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.3, 0.2))
         ).A
 
     robust = static("adaptive_robust", f"Kp = 1.0\n{ROBUST}")

@@ -17,7 +17,7 @@ from tests.unit_arm import H50, hand, unit_scenario
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.execution import virtual
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.scenario.describe import describe_law_conditions
 
 TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40.0}

@@ -12,7 +12,7 @@ import pytest
 
 from trilat_net.core.arms import chain_stages, two_link_arm, two_link_stages
 from trilat_net.core.arms.chain import friction_torque, inverse_dynamics
-from trilat_net.core.step.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.step.site_arrays import SiteArrays
 from trilat_net.core.step.vectors import Array
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.laws import BUILT_IN
@@ -50,7 +50,7 @@ def build(name: str, scenario: str) -> tuple[Any, SiteArrays]:
         gains[key] = tuple(first + step * n for n in range(count))
     law: Any = BUILT_IN[name].Settings(**gains)
     setup = setup._replace(gains=law.gains(setup.theta), tau_limit_nm=NO_LIMIT)
-    return law, build_site_arrays(setup, pages=8)
+    return law, SiteArrays.build(setup, pages=8)
 
 
 def put_random_state(row: Any, rng: np.random.Generator, *, exact: bool = False) -> None:

@@ -10,7 +10,7 @@ from tests.core.guarded_runs import RATE_NM_S, largest_step, ordered
 from tests.log_editing import opened, recorded
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.core.plug.compiled_law import is_compiled
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_scenario

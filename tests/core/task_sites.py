@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.core.chain_references import chain_references
 from trilat_net.core.arms.chain import ChainJoint
-from trilat_net.core.step.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.step.site_arrays import SiteArrays
 from trilat_net.core.step.site_setup import (
     ChainSetup,
     Gains,
@@ -30,7 +30,7 @@ def build(task: TaskSetup) -> SiteArrays:
         joints, tip_m=CHAIN.tip_origin_m, tip_rotation=CHAIN.tip_rotation, task=task
     )
     numbers = {"theta": THETA, "g_m_s2": 9.81, "lengths_m": (0.0, 0.0), "tau_limit_nm": 1e3}
-    return build_site_arrays(
+    return SiteArrays.build(
         SiteSetup(
             name="a",
             rate_hz=1000,

@@ -6,7 +6,7 @@ import pytest
 from tests.core.chain_references import Arm, ChainState, chain_references, moving, torque_for
 from trilat_net.core.arms.chain import ChainJoint
 from trilat_net.core.arms.chain_stages import place_chain, update_errors, update_torque
-from trilat_net.core.step.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.step.site_arrays import SiteArrays
 from trilat_net.core.step.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup
 from trilat_net.core.step.vectors import Array
 
@@ -25,7 +25,7 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
     n = len(joints)
     theta = np.concatenate([joint.inertia for joint in chain.joints])
     law = Gains(Lambda=(LAMBDA,), theta_hat0=theta, known=theta, **gains)  # type: ignore[arg-type]
-    arrays = build_site_arrays(
+    arrays = SiteArrays.build(
         SiteSetup(
             name="a",
             rate_hz=1000,

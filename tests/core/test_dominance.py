@@ -6,7 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.core.links.dominance import find_row_problem, is_irreducible, perron_vector
+from trilat_net.core.links.dominance import is_irreducible, perron_vector
+from trilat_net.scenario.resolve import find_row_problem
 
 Array = NDArray[np.float64]
 SMALLEST = 1e-6

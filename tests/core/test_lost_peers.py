@@ -17,7 +17,7 @@ from trilat_net.analysis.dominance_history import list_losses, trace_dominance
 from trilat_net.core.links.lost_peers import BACK_NS
 from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario

@@ -20,7 +20,7 @@ from trilat_net.core.life.session_life import update_session_life
 from trilat_net.core.step.site_setup import StaleAction
 from trilat_net.core.step.ticks import Mode, tick_ns
 from trilat_net.core.step.vectors import Array, Row
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 

@@ -24,13 +24,13 @@ from tests.core.rests import gravity_of, integrals, reference, rest_torque
 from trilat_net.analysis.arm_rows import PlanarArmRows, build_arm_rows
 from trilat_net.core.life.resting import limit_torque_rate
 from trilat_net.core.plug.user_law import LawContext, LawInput
-from trilat_net.core.step.site_arrays import build_site_arrays
+from trilat_net.core.step.site_arrays import SiteArrays
 from trilat_net.core.step.site_setup import RestGains
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, LifeOrder, Mode, TickInput
 from trilat_net.core.step.vectors import Array
 from trilat_net.execution.resumption import read_output
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS
@@ -149,7 +149,7 @@ def test_rate_limits_never_hold_back_braking(
     rate: float, before: float, wanted: float, speed: float
 ) -> None:
     """Against its motion a torque reaches B |qd| farther; along it, and in RUN, as far as the rate."""
-    arrays = build_site_arrays(guarded().setup("s"))
+    arrays = SiteArrays.build(guarded().setup("s"))
     s = arrays.site[0]
     for mode in (Mode.RUN, Mode.STOPPED, Mode.HOLD):
         s.mode, s.tau_rate, s.tau_before, s.tau, s.qd = mode, rate, before, wanted, speed

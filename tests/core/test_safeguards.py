@@ -26,9 +26,9 @@ from trilat_net.core.life.safeguards import BLEND_S
 from trilat_net.core.plug.user_law import LawContext, LawInput
 from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.run_changes import make_site_order

@@ -21,7 +21,7 @@ from trilat_net.core.step.ticks import (
     TickInput,
 )
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, parse_scenario
 

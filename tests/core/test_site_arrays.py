@@ -9,7 +9,7 @@ from tests.core.sites import setup
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import MAX_DELAY_US, max_delay_us
 from trilat_net.core.links.link import calendar_pages
-from trilat_net.core.step.site_arrays import build_site_arrays, stack_site_arrays
+from trilat_net.core.step.site_arrays import SiteArrays
 from trilat_net.scenario import load_scenario
 
 
@@ -29,7 +29,7 @@ def test_links_have_about_the_pages_they_need() -> None:
 
     def pages(**changes: object) -> int:
         setups = [setup(name, "free", **changes) for name in ("m1", "m2", "s")]
-        return stack_site_arrays(setups).calendars.shape[2]
+        return SiteArrays.stack(setups).calendars.shape[2]
 
     assert pages(link__delay_ms=200.0) == 256
     assert pages(link__delay_ms=0.0) <= 16
@@ -41,9 +41,9 @@ def test_links_have_about_the_pages_they_need() -> None:
 def test_stacked_tables_hold_each_sites_own() -> None:
     scenario = load_scenario("windup")
     setups = [scenario.setup(name) for name in scenario.names]
-    whole = stack_site_arrays(setups)
+    whole = SiteArrays.stack(setups)
     for n, setup_of_lane in enumerate(setups):
-        site_arrays = build_site_arrays(setup_of_lane)
+        site_arrays = SiteArrays.build(setup_of_lane)
         assert whole.site[n].tobytes() == site_arrays.site.tobytes()
         assert whole.links[n].tobytes() == site_arrays.links.tobytes()
         assert whole.ramps[n].tobytes() == site_arrays.ramps.tobytes()

@@ -10,7 +10,7 @@ from tests.execution.deliveries import TICKS
 from tests.log_editing import SHORT, edited, opened, recorded
 from trilat_net.core.step.ticks import PlantState
 from trilat_net.execution import virtual
-from trilat_net.execution.rerun import Rerun
+from trilat_net.execution.what_if import Rerun
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import STATE_VECTORS, State
 from trilat_net.scenario import load_scenario

@@ -15,9 +15,9 @@ from tests.log_editing import edited, opened, recorded, without
 from tests.log_surgery import Pieces, Stored, repacked, taken_apart
 from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
-from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.log_checks import LogCheckReport
+from trilat_net.execution.verification import verify
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.running_digest import DigestState
@@ -44,7 +44,7 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
         log = opened(data)
         if chained:
             return not judge_integrity(log).passed
-        return not run_log_checks(log, virtual=False).passed
+        return not LogCheckReport.of_log(log, virtual=False).passed
     except (LogError, ScenarioError):
         return True
 
@@ -53,10 +53,10 @@ def test_rewriting_without_changes_keeps_the_file() -> None:
     assert taken_apart(run()).bytes() == run()
     log = opened(run())
     assert judge_integrity(log).state is DigestState.INTACT
-    assert run_log_checks(log, virtual=True).passed
+    assert LogCheckReport.of_log(log, virtual=True).passed
     old = opened(pieces(chained=False).bytes())
     assert judge_integrity(old).state is DigestState.ABSENT
-    assert run_log_checks(old, virtual=True).passed
+    assert LogCheckReport.of_log(old, virtual=True).passed
 
 
 sites = st.one_of(st.sampled_from([(site,) for site in SITES]), st.just(SITES))
@@ -220,7 +220,7 @@ def test_sparse_logs_fail_with_the_judged_share() -> None:
     assert not verdict.passed
     assert verdict.coverage.judged["m1"] < 25
     assert verdict.coverage.share < 0.2
-    text = run_log_checks(log, virtual=False).findings[0].text
+    text = LogCheckReport.of_log(log, virtual=False).findings[0].text
     assert "m1" in text
     assert "less than 99.9 %" in text
 
@@ -279,7 +279,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
     assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
     (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")
-    alone = run_log_checks(open_log(log_path), virtual=True)
+    alone = LogCheckReport.of_log(open_log(log_path), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)
 
@@ -287,7 +287,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
 def test_lost_samples_excuse_virtual_time_afterwards() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
     log = opened(delivered({}, lost))
-    report = run_log_checks(log, virtual=True)
+    report = LogCheckReport.of_log(log, virtual=True)
     assert report.passed, report.findings
     assert (
         "20 lost on the way, the first: sample 40 of s was due at tick 60 of m2 and never came"
@@ -298,12 +298,14 @@ def test_lost_samples_excuse_virtual_time_afterwards() -> None:
     def record(r: dict) -> dict:
         return {**r, "tau": [r["tau"][0], r["tau"][1] + 1e-12]} if r["tick"] == 30 else r
 
-    changed = run_log_checks(opened(edited(delivered({}, lost), record=record)), virtual=True)
+    changed = LogCheckReport.of_log(
+        opened(edited(delivered({}, lost), record=record)), virtual=True
+    )
     assert not changed.findings[-1].passed
 
 
 def test_gaps_pass_with_possible_arrivals() -> None:
-    lines = run_log_checks(without_records({"m2": [50, 51]}), virtual=True).findings
+    lines = LogCheckReport.of_log(without_records({"m2": [50, 51]}), virtual=True).findings
     fed = next(line for line in lines if "fed" in line.check)
     assert fed.passed, fed
 

@@ -11,7 +11,7 @@ from tests.chains import six_joints
 from tests.log_editing import Record, edited, opened
 from trilat_net.core.arms.chain import LINK_PARAMETERS
 from trilat_net.errors import LogError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log

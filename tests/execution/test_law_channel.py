@@ -13,9 +13,9 @@ from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 from trilat_net.log.view_rates import FULL_RATE_HZ

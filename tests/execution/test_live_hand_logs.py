@@ -11,14 +11,14 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.torque_sources import compute_live_torque, split_torque
+from trilat_net.analysis.torque_sources import TorqueSplit, compute_live_torque
 from trilat_net.core.life.live_hand import HandCommand, HandMemory, advance_hand
 from trilat_net.core.step.site_step import Site
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -79,7 +79,7 @@ def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
     assert not torque[grip == 0.0].any()
     assert part.t_s[grip > 0.0].max() == pytest.approx(0.7 + 0.2 + 0.1, abs=0.03)
     records = align_records(held_log)["m1"]
-    split = split_torque(records, held_log.scenario)
+    split = TorqueSplit.of_records(records, held_log.scenario)
     source = held_log.scenario.sites["m1"].hands[0].actor
     expected = compute_live_torque(
         source, records.hand, records.q, records.qd, split.end_effector

@@ -18,7 +18,7 @@ from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_
 from trilat_net.log.log_reader import Log
 from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.program_hand import HandPlayer, find_own_hand
+from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
 from trilat_net.scenario.plant_player import make_plant_players
 
 SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
@@ -76,7 +76,7 @@ def test_a_log_repeats_a_hand_without_its_class(kind: str) -> None:
 def test_a_hand_sees_its_peers_after_the_delay() -> None:
     scenario = load_scenario("paper", {**at_m2(), "link.delay_ms": 200})
     seen: list[HandView] = []
-    at = find_own_hand(scenario, "m2")
+    at = HandSite.find(scenario, "m2")
     assert at is not None
     player = HandPlayer(at, Follower(at.describe()))
 

@@ -9,10 +9,10 @@ from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import opened, recorded
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
-from trilat_net.execution.rerun import rerun
 from trilat_net.execution.resumption import RecordedInputs, read_output
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 
 LAWS = ("Line", "CompiledLine")
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}

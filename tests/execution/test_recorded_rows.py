@@ -13,7 +13,7 @@ from tests.execution.logs import external_log, simulated, without_records
 from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.core.step import recorded_ticks
 from trilat_net.core.step.site_step import Site
-from trilat_net.execution import recorded_rows, verify
+from trilat_net.execution import recorded_rows, verification
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import list_shipped
 
@@ -22,20 +22,20 @@ SITES = ("m1", "m2", "s")
 PAPER = recorded("paper", {"duration_s": 0.4, "link.delay_ms": 20.0})
 
 
-def verify_singly(log: Log, **options: Any) -> verify.VerifyResult:
+def verify_singly(log: Log, **options: Any) -> verification.VerifyResult:
     """Verifies a log by `Site.step` alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verify, "make_sample_table", lambda _: None)
-        return verify.verify(log, **options)
+        patch.setattr(verification, "make_sample_table", lambda _: None)
+        return verification.verify(log, **options)
 
 
-def assert_same_result(data: bytes, **options: Any) -> verify.VerifyResult:
-    result = verify.verify(opened(data), **options)
+def assert_same_result(data: bytes, **options: Any) -> verification.VerifyResult:
+    result = verification.verify(opened(data), **options)
     assert result == verify_singly(opened(data), **options)
     return result
 
 
-def without_single_ticks(log: Log) -> verify.VerifyResult:
+def without_single_ticks(log: Log) -> verification.VerifyResult:
     """Verifies a log by the compiled loop alone."""
 
     def step(*_: Any) -> None:
@@ -43,7 +43,7 @@ def without_single_ticks(log: Log) -> verify.VerifyResult:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Site, "step", step)
-        return verify.verify(log)
+        return verification.verify(log)
 
 
 @pytest.mark.parametrize("name", ["paper", "six_joints", "jitter", "contact", "unlike_arms"])
@@ -118,15 +118,15 @@ def test_both_ways_agree_on_spoiled_records(seed: int) -> None:
 def test_both_ways_agree_behind_gaps() -> None:
     log = without_records({"m1": range(100, 110), "s": [200, 202]}, PAPER)
     again = without_records({"m1": range(100, 110), "s": [200, 202]}, PAPER)
-    result = verify.verify(log)
+    result = verification.verify(log)
     assert result == verify_singly(again)
     assert result.unjudged > 0
 
 
 def test_short_and_long_blocks_end_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = verify.verify(opened(PAPER))
+    expected = verification.verify(opened(PAPER))
     monkeypatch.setattr(recorded_rows, "BLOCK_ROWS", 37)
-    assert verify.verify(opened(PAPER)) == expected
+    assert verification.verify(opened(PAPER)) == expected
 
 
 def test_calendars_that_are_too_short_are_replaced() -> None:
@@ -134,7 +134,7 @@ def test_calendars_that_are_too_short_are_replaced() -> None:
     log = simulated(
         "paper", {"duration_s": 1.5, "link.delay_ms": 5.0, "timeline": changes, "expect": {}}
     )
-    result = verify.verify(log)
+    result = verification.verify(log)
     assert result.passed
     assert result == verify_singly(log)
 

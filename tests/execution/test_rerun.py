@@ -21,8 +21,8 @@ from tests.log_editing import edited, opened, recorded
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickInput
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import TOLERANCE, equal_record
+from trilat_net.execution.verification import TOLERANCE, equal_record
+from trilat_net.execution.what_if import rerun
 from trilat_net.scenario import list_shipped, load_scenario
 
 from .logs import all_identical, motion, simulated

@@ -16,7 +16,7 @@ from tests.execution.deliveries import (
 )
 from tests.log_editing import edited, opened, recorded
 from trilat_net.errors import LogError
-from trilat_net.execution.rerun import rerun
+from trilat_net.execution.what_if import rerun
 
 from .logs import all_identical, motion, without_records
 

@@ -8,10 +8,10 @@ import pytest
 
 from tests.log_editing import opened, recorded
 from trilat_net.errors import UsageError
-from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.rerun import rerun
-from trilat_net.execution.verify import verify
+from trilat_net.execution.log_checks import LogCheckReport
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.messages import VERSION
 
@@ -71,7 +71,7 @@ def test_only_executed_sites_are_verified(replace: list[str]) -> None:
     assert after.executed_sites == tuple(sorted(replace))
     assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records == TICKS * len(replace)
-    lines = run_log_checks(after, virtual=True).findings
+    lines = LogCheckReport.of_log(after, virtual=True).findings
     others = [name for name in SITES if name not in replace]
     assert [line.check for line in lines if not line.passed] == ["records"] * bool(others), (
         lines

@@ -6,7 +6,7 @@ import pytest
 import trilat_net
 from tests.task_arms import planar_task
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.run_end import classify_log_end
+from trilat_net.analysis.run_end import RunEnd
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.figures.registry import list_drawable_figures
@@ -55,7 +55,7 @@ def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
 
 
 def test_a_runs_end_is_in_metres(log: Log) -> None:
-    assert classify_log_end(log).error_unit == "m"
+    assert RunEnd.of_log(log).error_unit == "m"
 
 
 TOUCH = """[[sites.m.hands]]

@@ -12,10 +12,6 @@ from trilat_net.execution.lanes import twin_lanes
 from trilat_net.execution.twins import (
     Push,
     Twins,
-    choose_pushes,
-    parse_push,
-    run_twins,
-    run_virtual_twins,
 )
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -51,19 +47,19 @@ def check_both_ways(monkeypatch: pytest.MonkeyPatch, run: Runner) -> Twins:
 
 def push_in_many_ways(scenario: Scenario, site: str) -> list[Push]:
     """At the start, in the middle, so often that differences are scaled, and of the estimate."""
-    often = parse_push(scenario, f"{site}.q1", 1e-9)._replace(largest=2e-9)
+    often = Push.parse(scenario, f"{site}.q1", 1e-9)._replace(largest=2e-9)
     return [
-        parse_push(scenario, f"{site}.q1"),
+        Push.parse(scenario, f"{site}.q1"),
         often,
-        parse_push(scenario, f"{site}.qd2", 1e-6, 1.3),
-        parse_push(scenario, "q", 1e-5),
+        Push.parse(scenario, f"{site}.qd2", 1e-6, 1.3),
+        Push.parse(scenario, "q", 1e-5),
     ]
 
 
 @pytest.mark.parametrize("name", ["live-4g", "live-paper"])
 def test_twins_of_live_log_equal_in_lanes(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     log = tn.open_log(GOLDEN / f"{name}.mcap")
-    twins = check_both_ways(monkeypatch, lambda: run_twins(log, choose_pushes(log.scenario)))
+    twins = check_both_ways(monkeypatch, lambda: Twins.of_log(log, Push.choose(log.scenario)))
     assert twins.same
     assert np.isfinite(twins.paths[0].largest).any()
 
@@ -72,7 +68,7 @@ def test_scaled_twins_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> Non
     at_rest = {f"sites.{site}.q0_rad": [0.3, 0.5] for site in ("m1", "m2", "s")}
     scenario = load_scenario("p_d_margin", {"control.K": 40.0, "control.d": 0.5, **at_rest})
     pushes = push_in_many_ways(scenario, "m1")
-    twins = check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))
+    twins = check_both_ways(monkeypatch, lambda: Twins.of_scenario(scenario, pushes, 4.0))
     assert twins.paths[1].scale.any()
     assert twins.paths[2].pushed == (26,)
 
@@ -81,17 +77,17 @@ def test_twins_of_compiled_law_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -
     wave = {"control.law": "wave", "scheme": "digital"}
     scenario = load_scenario("two_sites", {"link.delay_ms": 120.0, **wave})
     pushes = push_in_many_ways(scenario, "m")
-    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))
+    check_both_ways(monkeypatch, lambda: Twins.of_scenario(scenario, pushes, 4.0))
 
 
 def test_twins_of_a_chain_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load_scenario("six_joints")
     pushes = push_in_many_ways(scenario, scenario.names[0])
-    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 2.0))
+    check_both_ways(monkeypatch, lambda: Twins.of_scenario(scenario, pushes, 2.0))
 
 
 def test_twins_that_leave_their_limits_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """An arm passes its speed limit after some windows; the lanes then start again one by one."""
     scenario = load_scenario("two_sites", {"limits.qd_limit_rad_s": 1.0})
     pushes = push_in_many_ways(scenario, "m")
-    check_both_ways(monkeypatch, lambda: run_virtual_twins(scenario, pushes, 4.0))
+    check_both_ways(monkeypatch, lambda: Twins.of_scenario(scenario, pushes, 4.0))

@@ -14,10 +14,6 @@ from trilat_net.execution.twins import (
     LARGEST,
     Push,
     Twins,
-    choose_pushes,
-    parse_push,
-    run_twins,
-    run_virtual_twins,
 )
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -37,7 +33,7 @@ def rate_per_s(scenario: Scenario, twins: Twins) -> float:
 @pytest.mark.parametrize(("d", "seconds"), [(0.5, 40.0), (2.0, 40.0), (3.0, 40.0)])
 def test_linear_differences_obey_their_root(d: float, seconds: float) -> None:
     scenario = at_rest(d)
-    twins = run_virtual_twins(scenario, [parse_push(scenario, "m1.q1", 1e-7)], seconds)
+    twins = Twins.of_scenario(scenario, [Push.parse(scenario, "m1.q1", 1e-7)], seconds)
     roots = tn.linear("p_d_margin", {"control.d": d}, pose=(0.3, 0.5), ports=False).to_dict()
     root_per_s = roots["as_computed"]["roots"][0]["re_per_s"]
     assert rate_per_s(scenario, twins) == pytest.approx(root_per_s, rel=0.02)
@@ -46,7 +42,7 @@ def test_linear_differences_obey_their_root(d: float, seconds: float) -> None:
 def test_a_zero_push_changes_no_bit() -> None:
     scenario = load_scenario("paper")
     by = np.zeros((3, 2))
-    twins = run_virtual_twins(
+    twins = Twins.of_scenario(
         scenario, [Push("nothing", "q", by), Push("nothing later", "qd", by, 1.3)], 3.0
     )
     assert not np.isfinite([path.largest for path in twins.paths]).any()
@@ -57,14 +53,14 @@ def test_a_zero_push_changes_no_bit() -> None:
 def test_a_live_run_is_repeated_bit_for_bit(name: str) -> None:
     """With its recorded arrivals: late samples, lost samples, and early samples."""
     log = tn.open_log(GOLDEN / f"{name}.mcap")
-    twins = run_twins(log, choose_pushes(log.scenario, 1))
+    twins = Twins.of_log(log, Push.choose(log.scenario, 1))
     assert twins.same
     assert np.isfinite(twins.paths[0].largest[1:-1]).all()
 
 
 def test_pushes_never_reach_other_closed_groups() -> None:
     scenario = two_pairs((p_d(2.0), p_d(2.0)), (0.1, 0.3, 0.2, 0.6))
-    twins = run_virtual_twins(scenario, [parse_push(scenario, "a.q1")], 4.0)
+    twins = Twins.of_scenario(scenario, [Push.parse(scenario, "a.q1")], 4.0)
     reached = np.isfinite(twins.paths[0].largest).any(axis=0)
     assert reached.tolist() == [True] * 4 + [False] * 4
 
@@ -72,9 +68,9 @@ def test_pushes_never_reach_other_closed_groups() -> None:
 @pytest.mark.long
 def test_rescaling_a_difference_keeps_its_rate() -> None:
     scenario = at_rest(0.5)
-    free = parse_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
+    free = Push.parse(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
     often = free._replace(largest=2e-9)
-    twins = run_virtual_twins(scenario, [free, often], 100.0)
+    twins = Twins.of_scenario(scenario, [free, often], 100.0)
     assert not twins.paths[0].scale.any()
     assert np.count_nonzero(np.diff(twins.paths[1].scale)) >= 3
     first, second = (path.largest[100:-2].max(axis=1) for path in twins.paths)
@@ -83,8 +79,8 @@ def test_rescaling_a_difference_keeps_its_rate() -> None:
 
 def test_dying_differences_end_or_are_repeated() -> None:
     scenario = at_rest(3.0)
-    once = parse_push(scenario, "m1.qd2", 1e-9)
-    twins = run_virtual_twins(scenario, [once, once._replace(again=True)], 60.0)
+    once = Push.parse(scenario, "m1.qd2", 1e-9)
+    twins = Twins.of_scenario(scenario, [once, once._replace(again=True)], 60.0)
     ended, anew = twins.paths
     assert ended.died is not None
     assert not np.isfinite(ended.largest[ended.died :]).any()
@@ -107,7 +103,7 @@ def test_a_twin_beyond_its_limits_is_reported() -> None:
 
 def test_a_push_acts_at_its_instant() -> None:
     scenario = load_scenario("two_sites")
-    twins = run_virtual_twins(scenario, [parse_push(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)
+    twins = Twins.of_scenario(scenario, [Push.parse(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)
     path = twins.paths[0]
     assert path.pushed == (25,)
     assert not np.isfinite(path.largest[:25]).any()
@@ -120,7 +116,7 @@ def test_a_push_acts_at_its_instant() -> None:
     ]
     assert path.push.largest == math.inf > LARGEST
     with pytest.raises(NotRepeatable, match="within the run"):
-        run_virtual_twins(scenario, [path.push._replace(at_s=2.0)], 2.0)
+        Twins.of_scenario(scenario, [path.push._replace(at_s=2.0)], 2.0)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +133,7 @@ def test_a_push_acts_at_its_instant() -> None:
 def test_a_push_is_named_by_words(
     target: str, name: str, pushed: list[tuple[int, int]]
 ) -> None:
-    push = parse_push(load_scenario("paper"), target)
+    push = Push.parse(load_scenario("paper"), target)
     assert push.name == name
     assert [tuple(at) for at in np.argwhere(push.by).tolist()] == pushed
     assert np.abs(push.by).max() <= 1e-6
@@ -148,10 +144,10 @@ def test_a_push_is_named_by_words(
 )
 def test_impossible_pushes_name_the_possible_ones(target: str) -> None:
     with pytest.raises(UsageError, match=r"no such number; .* m1 \(2 joints, 5 estimates\)"):
-        parse_push(load_scenario("paper"), target)
+        Push.parse(load_scenario("paper"), target)
 
 
 @pytest.mark.parametrize("size", [0.0, math.nan, math.inf, 1e-12, -2.0])
 def test_an_invalid_size_is_refused(size: float) -> None:
     with pytest.raises(UsageError, match="from 1e-11 to 1"):
-        parse_push(load_scenario("paper"), "m1.q1", size)
+        Push.parse(load_scenario("paper"), "m1.q1", size)

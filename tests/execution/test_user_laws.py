@@ -11,8 +11,8 @@ from tests.execution.logs import OTHER_PLATFORM, external_log, numbers, without_
 from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.errors import LawFailed, ScenarioError, UsageError, join_arguments
 from trilat_net.execution import virtual
-from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.verify import verify
+from trilat_net.execution.log_checks import LogCheckReport
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.own_code.code_consent import find_user_laws
@@ -99,7 +99,7 @@ def test_reports_explain_hidden_memory() -> None:
     (law,) = find_user_laws(log.scenario)[:1]
 
     def find_text(**settings: int) -> str:
-        findings = run_log_checks(log, virtual=False, **settings).findings
+        findings = LogCheckReport.of_log(log, virtual=False, **settings).findings
         return next(finding.text for finding in findings if finding.check == "executed again")
 
     verify_command = [
@@ -114,7 +114,7 @@ def test_reports_explain_hidden_memory() -> None:
     command = join_arguments(verify_command)
     assert find_text().endswith(f"but by: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
-    built_in = run_log_checks(opened(recorded("paper")), virtual=False)
+    built_in = LogCheckReport.of_log(opened(recorded("paper")), virtual=False)
     assert not [finding for finding in built_in.findings if "--resume-every" in finding.text]
 
 

@@ -21,7 +21,7 @@ from tests.execution.deliveries import (
 from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import Record, edited, opened, recorded, without
 from trilat_net.core.step.site_setup import Layout
-from trilat_net.execution.verify import RecordDifference, verify
+from trilat_net.execution.verification import RecordDifference, verify
 from trilat_net.scenario import list_shipped
 
 VECTORS = Layout().lengths()

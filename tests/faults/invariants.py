@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from trilat_net.errors import TrilatError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.messages import State
 from trilat_net.scenario import Scenario

@@ -15,7 +15,7 @@ import pytest
 
 from trilat_net.app.api import simulate
 from trilat_net.core.step.fingerprint import compute_fingerprint
-from trilat_net.execution.verify import TOLERANCE, verify
+from trilat_net.execution.verification import TOLERANCE, verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.mcap_reader import McapReader
-from trilat_net.log.recover import Recovery, recover
+from trilat_net.log.recovery import Recovery, recover
 from trilat_net.net.clock import SystemClock
 
 from .processes import Session, Stage

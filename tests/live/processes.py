@@ -13,7 +13,7 @@ import numpy as np
 from tests.cli.running import COMMAND, PLAIN
 from tests.faults.invariants import SILENT_TICKS, count_silence, stretches
 from tests.net.waiting import until
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log

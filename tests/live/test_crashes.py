@@ -6,10 +6,10 @@ import signal
 import pytest
 from mcap.reader import make_reader
 
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 
 from .killing import SITES, killed
 from .processes import Session, Stage, executed_again

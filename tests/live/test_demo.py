@@ -11,7 +11,7 @@ import pytest
 import trilat_net
 from tests.cli.running import trilat
 from tests.net.waiting import until
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 
 from .processes import Process, Stage, gone, recorded

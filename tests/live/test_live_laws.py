@@ -9,7 +9,7 @@ from sites.site_parts import warm_up
 from tests.control_laws.law_settings import LAWS
 from tests.energy_runs import FOLLOWER
 from tests.unit_arm import H50, hand, unit_text
-from trilat_net.analysis.certificate.observed_energy import ObservedFinding, observe_energies
+from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, ObservedFinding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import load_scenario
 
@@ -55,7 +55,7 @@ def test_waves_through_200_ms(stage: Stage) -> None:
     assert [m.q[-1, 0], s.q[-1, 0]] == pytest.approx([0.3, 0.3], abs=2e-3)
     assert np.abs(m.q - s.q)[:, 0].max() == pytest.approx(0.0476, rel=0.01)
     assert -m.tau[:, 0].min() == pytest.approx(1.763, rel=0.01)
-    assert observe_energies(log).finding is ObservedFinding.PASSIVE
+    assert ObservedEnergy.of_log(log).finding is ObservedFinding.PASSIVE
 
 
 def test_passivity_control_through_50_ms(stage: Stage) -> None:

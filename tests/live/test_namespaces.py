@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.truth import Member, again, judge_link, members, offset_errors
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import parse_scenario
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.net.waiting import until
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock

@@ -5,8 +5,8 @@ from itertools import combinations
 import pytest
 
 from tests.cli.running import trilat
-from trilat_net.execution.rerun import rerun
 from trilat_net.execution.virtual_comparison import find_absent_samples
+from trilat_net.execution.what_if import rerun
 
 from .processes import PAPER, Session, Stage, connections, whole
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import pytest
 
 from tests.faults.invariants import SILENT_TICKS
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.session_check import check_file
 

@@ -5,7 +5,7 @@ import signal
 import pytest
 
 from tests.net.certificates import Certificates
-from trilat_net.execution.log_checks import run_log_checks
+from trilat_net.execution.log_checks import LogCheckReport
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.member_keys import create_keys
 from trilat_net.net.zenoh_config import OPERATOR, RECORDER, ROUTER
@@ -93,7 +93,7 @@ def test_sessions_heal_when_killed_routers_return(stage: Stage) -> None:
     log = open_log(session.log)
     assert log.complete
     assert all("missing 0," in log.account(name) for name in SITES)
-    report = run_log_checks(log, virtual=True)
+    report = LogCheckReport.of_log(log, virtual=True)
     assert report.passed, report.findings  # samples were lost on the way, and the log shows it
     for name, peer in (SITES, SITES[::-1]):
         used = [state.used[peer] for state in log[name].states]

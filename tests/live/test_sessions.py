@@ -6,7 +6,7 @@ import pytest
 
 from sites.site_parts import warm_up
 from tests.net.waiting import until
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import find_absent_samples
 from trilat_net.log.log_reader import open_log
 from trilat_net.net import topics

@@ -13,9 +13,9 @@ from mcap.writer import CompressionType, Writer
 from tests.log.dealt import Message, messages
 from tests.log_editing import recorded
 from trilat_net.errors import LogError, NothingSaved
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 from trilat_net.log.torn_chunk import PAGE_BYTES
 
 GOLDEN = Path(__file__).parents[1] / "golden"

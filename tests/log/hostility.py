@@ -16,10 +16,10 @@ from tests.log_editing import edited
 from trilat_net.analysis.file_overview import info
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import TrilatError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 from trilat_net.log.session_check import check_file
 
 LENGTHS = (

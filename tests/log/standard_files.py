@@ -9,7 +9,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
 from trilat_net.log.provenance import collect_provenance
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 from trilat_net.log.ros2.viz_channels import offer_views
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state

@@ -15,11 +15,11 @@ from tests.log.bad_pages import GOLDEN, damaged, recovered_all, rewritten, shelf
 from tests.log.dealt import messages
 from tests.log_editing import recorded
 from trilat_net.errors import LogError, NothingSaved
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import SCENARIO, SESSION
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import RecordScanner
-from trilat_net.log.recover import Recovery, recover
+from trilat_net.log.recovery import Recovery, recover
 from trilat_net.log.running_digest import DigestState
 from trilat_net.log.session_check import check_file
 from trilat_net.log.torn_chunk import PAGE_BYTES

@@ -24,7 +24,7 @@ from tests.log.hostility import CHANGES, chunk, mangled, read_by_all
 from tests.log_editing import edited, opened, recorded
 from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
 from trilat_net.scenario import load_scenario, parse_embedded
 

@@ -26,7 +26,7 @@ from trilat_net.log.log_file import (
     LogFile,
 )
 from trilat_net.log.log_layout import active_path
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 
 from .disks import Sent, SmallDisk, begun, file_on, sent
 

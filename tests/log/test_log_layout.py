@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from trilat_net.errors import UsageError
-from trilat_net.log.log_layout import (
-    RECORDER_CHANNELS,
-    SITE_CHANNELS,
-    ChannelFilter,
-    parse_channel_filter,
-)
+from trilat_net.log.log_layout import RECORDER_CHANNELS, SITE_CHANNELS, ChannelFilter
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.net.bus import matches_key
@@ -46,13 +41,13 @@ def test_expressions_match_like_those_of_zenoh(expression: str, key: str) -> Non
 @pytest.mark.parametrize("text", ["", "a//b", "a*", "***", "a/$", "a?", "#", "*m1/**"])
 def test_an_invalid_expression_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="must be a key expression such as"):
-        parse_channel_filter([text], [])
+        ChannelFilter.parse([text], [])
     with pytest.raises(UsageError, match="exclude must be"):
-        parse_channel_filter([], [text])
+        ChannelFilter.parse([], [text])
 
 
 def test_a_leading_slash_is_fine() -> None:
-    assert parse_channel_filter(["/trilat/**"], ["/**/m$*/link"]) == ChannelFilter(
+    assert ChannelFilter.parse(["/trilat/**"], ["/**/m$*/link"]) == ChannelFilter(
         ("trilat/**",), ("**/m$*/link",)
     )
 

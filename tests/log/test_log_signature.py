@@ -22,7 +22,7 @@ from tests.log_editing import edited, recorded
 from trilat_net.errors import LogError, LogRefused, UsageError
 from trilat_net.log.log_signature import check_signatures, create_signing_keys, sign_log
 from trilat_net.log.mcap_reader import McapReader
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 
 
 @pytest.fixture

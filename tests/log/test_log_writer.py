@@ -9,11 +9,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from trilat_net.app.cli.members import parse_split
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_file import LogFile
 from trilat_net.log.log_layout import find_parts, part_path
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, parse_split
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics

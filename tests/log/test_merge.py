@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.log.dealt import Message, a_file, changed, dealt, messages
 from tests.log_editing import opened, recorded
 from trilat_net.errors import LogError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance

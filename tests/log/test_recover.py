@@ -22,12 +22,12 @@ from tests.log.dealt import Message, foreign, messages
 from tests.log.hostility import chunk as packed_chunk
 from tests.log_editing import edited, opened, recorded, without
 from trilat_net.errors import LogError, NothingSaved, UsageError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
-from trilat_net.log.recover import Recovery, recover, recovered_path
+from trilat_net.log.recovery import Recovery, recover, recovered_path
 
 anywhere = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12

@@ -18,7 +18,7 @@ from tests.log.dealt import foreign, split
 from tests.log.hostility import chunk
 from tests.log_editing import edited, recorded, without
 from trilat_net.errors import LogError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import (
     MAGIC,
@@ -27,7 +27,7 @@ from trilat_net.log.mcap_records import (
     RecordScanner,
     unpack_chunk,
 )
-from trilat_net.log.recover import recover
+from trilat_net.log.recovery import recover
 from trilat_net.log.session_check import LogCheckResult, check_file
 
 WHOLE = recorded("paper")

@@ -19,9 +19,7 @@ from trilat_net.net.connection import (
     default_endpoint,
     default_endpoints,
     find_free_endpoints,
-    open_bus,
     reserve_session_endpoints,
-    resolve_member_connection,
     run_router,
 )
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -43,7 +41,7 @@ def member(
     routers: list[str] | None = None,
     own: ZenohFile | None = None,
 ) -> Connection:
-    return resolve_member_connection(listen, connect, routers, own, HERE, THERE)
+    return Connection.of_member(listen, connect, routers, own, HERE, THERE)
 
 
 def test_defaults_stay_on_this_machine() -> None:
@@ -138,7 +136,7 @@ def test_any_address_of_zenoh_may_be_a_router(endpoint: str) -> None:
 def router(
     listen: list[str] | None, connect: list[str] | None, zenoh_file: ZenohFile | None
 ) -> Connection:
-    return resolve_member_connection(listen, connect, None, zenoh_file, HERE, routes=True)
+    return Connection.of_member(listen, connect, None, zenoh_file, HERE, routes=True)
 
 
 def test_routers_listen_and_connect_as_configured() -> None:
@@ -182,7 +180,7 @@ class Answering(ManualClock):
 def test_late_routers_are_awaited() -> None:
     endpoints = find_free_endpoints(1)
     clock, said = Answering(endpoints, comes_after=3), []
-    bus = open_bus(Connection((), endpoints, "client"), clock, clock.stopped, 5.0, said.append)
+    bus = Connection((), endpoints, "client").open_bus(clock, clock.stopped, 5.0, said.append)
     assert bus is not None
     bus.close()
     assert clock.router is not None
@@ -198,17 +196,17 @@ def test_missing_routers_are_reported_and_signals_end_waiting() -> None:
     with pytest.raises(
         SessionError, match=f"no router answers at {', '.join(endpoints)} within 1 s"
     ):
-        open_bus(connection, clock, clock.stopped, 1.0, lambda _: None)
+        connection.open_bus(clock, clock.stopped, 1.0, lambda _: None)
     clock = Answering(endpoints, stops_after=4)
-    assert open_bus(connection, clock, clock.stopped, None, lambda _: None) is None
+    assert connection.open_bus(clock, clock.stopped, None, lambda _: None) is None
     assert clock.sleeps == 4
 
 
 def test_peers_wait_for_nobody() -> None:
     endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
-    bus = open_bus(
-        Connection(endpoints[:1], endpoints[1:]), clock, clock.stopped, 0.0, lambda _: None
+    bus = Connection(endpoints[:1], endpoints[1:]).open_bus(
+        clock, clock.stopped, 0.0, lambda _: None
     )
     assert bus is not None
     bus.close()

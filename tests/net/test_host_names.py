@@ -8,7 +8,7 @@ import pytest
 
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import UsageError
-from trilat_net.net.connection import Connection, open_bus
+from trilat_net.net.connection import Connection
 from trilat_net.net.host_names import UnknownHost, check_hosts
 
 NO_NAME = "no..host"
@@ -67,7 +67,7 @@ def test_members_with_unknown_names_never_wait() -> None:
         Connection(connect=[f"tcp/{NO_NAME}:1"], keys_of="m"),
     ):
         with pytest.raises(UsageError, match=rf"{NO_NAME}:1: the host name"):
-            open_bus(connection, ManualClock(), lambda: False, None, said.append)
+            connection.open_bus(ManualClock(), lambda: False, None, said.append)
     assert said == []
 
 

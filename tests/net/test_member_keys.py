@@ -24,7 +24,7 @@ from trilat_net.app.cli.options import check_session_name
 from trilat_net.errors import LogRefused, ScenarioError, UsageError
 from trilat_net.net import member_keys, topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
+from trilat_net.net.connection import Connection, find_free_endpoints
 from trilat_net.net.member_keys import (
     CERTIFICATE,
     MEMBERS,
@@ -373,29 +373,25 @@ def test_keys_readable_by_others_are_refused(folder: Path, tmp_path: Path) -> No
 )
 def test_without_keys_nobody_listens_on_a_network(listen: str, open_: bool) -> None:
     connection = Connection([listen])
-    assert secure_connection(connection, None, insecure=True) == connection
+    assert connection.secure(None, insecure=True) == connection
     if open_:
         with pytest.raises(UsageError, match="insecure=True"):
-            secure_connection(connection, None, insecure=False)
+            connection.secure(None, insecure=False)
     else:
-        assert secure_connection(connection, None, insecure=False) == connection
+        assert connection.secure(None, insecure=False) == connection
 
 
 def test_own_mutual_tls_equals_keys() -> None:
     settings = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
     safe = Connection(["tls/192.0.2.1:7447"], settings=settings)
-    assert secure_connection(safe, None, insecure=False) == safe
+    assert safe.secure(None, insecure=False) == safe
     with pytest.raises(UsageError, match="insecure=True"):
-        secure_connection(
-            Connection(["tcp/192.0.2.1:7447"], settings=settings), None, insecure=False
-        )
+        Connection(["tcp/192.0.2.1:7447"], settings=settings).secure(None, insecure=False)
 
 
 def test_with_keys_links_are_encrypted(folder: Path) -> None:
     keys = read_member_keys(folder / "m1")
-    safe = secure_connection(
-        Connection(["tls/127.0.0.1:1"], ["quic/192.0.2.1:7"]), keys, insecure=False
-    )
+    safe = Connection(["tls/127.0.0.1:1"], ["quic/192.0.2.1:7"]).secure(keys, insecure=False)
     # where it finds a session by default
     assert safe.reach(["tcp/127.0.0.1:1"]) == ["tls/127.0.0.1:1"]
     plain_ones = (
@@ -407,11 +403,9 @@ def test_with_keys_links_are_encrypted(folder: Path) -> None:
     )
     for plain in plain_ones:
         with pytest.raises(UsageError, match="tls"):
-            secure_connection(Connection([], [plain]), keys, insecure=True)
+            Connection([], [plain]).secure(keys, insecure=True)
     with pytest.raises(UsageError, match="access_control is also set by keys"):
-        secure_connection(
-            Connection(settings={"access_control": {"enabled": True}}), keys, insecure=False
-        )
+        Connection(settings={"access_control": {"enabled": True}}).secure(keys, insecure=False)
 
 
 def test_every_rule_names_members_and_denies_others() -> None:
@@ -659,14 +653,11 @@ def test_keys_ending_before_sessions_are_refused(tmp_path: Path) -> None:
         assert done.code == 2, done
         assert f"--keys: the keys of {member} expire on " in done.err
         assert "renew the keys with trilat keys renew" in done.err
-    connection = secure_connection(Connection(), tmp_path / "keys" / "m", insecure=False)
+    connection = Connection().secure(tmp_path / "keys" / "m", insecure=False)
     connection.require_keys_until(86_000.0)
     assert "the keys of m expire on" in connection.describe_end()
     with pytest.raises(UsageError, match="the session is planned until"):
         connection.require_keys_until(86_500.0)
     create_keys(tmp_path / "later", ["m"], days=8)
-    assert (
-        secure_connection(Connection(), tmp_path / "later" / "m", insecure=False).describe_end()
-        == ""
-    )
+    assert Connection().secure(tmp_path / "later" / "m", insecure=False).describe_end() == ""
     Connection().require_keys_until(1e9)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from trilat_net.errors import UsageError
-from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
+from trilat_net.net.connection import Connection, find_free_endpoints
 from trilat_net.net.member_keys import create_keys, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 
@@ -31,7 +31,7 @@ def test_samples_arrive_over_each_transport(transport: str, tmp_path: Path) -> N
     def connect(member: str, listen: list[str], others: list[str]) -> ZenohBus:
         keys = read_member_keys(tmp_path / "keys" / member) if with_keys else None
         stated = Connection(listen, others)
-        safe = secure_connection(stated, keys, insecure=False)
+        safe = stated.secure(keys, insecure=False)
         return ZenohBus(safe.listen, others, settings=safe.settings)
 
     with (
@@ -52,12 +52,12 @@ def test_samples_arrive_over_each_transport(transport: str, tmp_path: Path) -> N
 def test_without_keys_other_machines_need_insecure(transport: str) -> None:
     connection = Connection([f"{transport}/0.0.0.0:7447"], [])
     with pytest.raises(UsageError, match="anybody on that network"):
-        secure_connection(connection, None, insecure=False)
-    assert secure_connection(connection, None, insecure=True) == connection
+        connection.secure(None, insecure=False)
+    assert connection.secure(None, insecure=True) == connection
 
 
 @pytest.mark.parametrize("insecure", [False, True])
 def test_udp_is_refused_even_on_loopback(insecure: bool) -> None:
     connection = Connection(["udp/127.0.0.1:7447"], [])
     with pytest.raises(UsageError, match=r"UDP is not supported.*use tcp, tls or quic"):
-        secure_connection(connection, None, insecure=insecure)
+        connection.secure(None, insecure=insecure)

@@ -15,7 +15,7 @@ from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, TwinGrowth
-from trilat_net.execution.twins import choose_pushes
+from trilat_net.execution.twins import Push
 from trilat_net.presentation.certificate_text import (
     describe_certificate,
     describe_in_words,
@@ -122,7 +122,7 @@ def test_the_first_line_agrees_with_its_judgement(
 
 
 PUSH = PushGrowth(
-    push=choose_pushes(load_scenario("two_sites"))[0],
+    push=Push.choose(load_scenario("two_sites"))[0],
     trend=EnvelopeTrend.DECAYS,
     rate_per_s=-0.5,
     factor=0.01,

@@ -14,7 +14,7 @@ from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.presentation import charts
-from trilat_net.presentation.appearance import REPORT_SIZE, make_print_size
+from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize
 from trilat_net.presentation.figures import arm_poses, joint_motion
 from trilat_net.presentation.style import arrange_joints
 from trilat_net.scenario import parse_scenario
@@ -65,7 +65,7 @@ def test_panels_of_joints_fill_their_rows():
     "form",
     [
         pytest.param(REPORT_SIZE, id="report"),
-        pytest.param(make_print_size(3.5), id="narrow", marks=pytest.mark.long),
+        pytest.param(FigureSize.for_print(3.5), id="narrow", marks=pytest.mark.long),
     ],
 )
 @pytest.mark.parametrize(

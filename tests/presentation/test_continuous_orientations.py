@@ -46,7 +46,7 @@ from trilat_net.log.orientations import (
     compute_quaternions,
     expand_poses,
 )
-from trilat_net.log.ros2.topic_names import read_topic_table
+from trilat_net.log.ros2.topic_names import TopicTable
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 EVERY = [0, *(pytest.param(number, marks=pytest.mark.long) for number in MOTIONS if number)]
@@ -231,7 +231,7 @@ class Graph:
 
 def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Iterator[Series]:
     graph = Graph()
-    ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+    ends: Any = BridgeEnds(graph, None, None, "t", TopicTable.read("crisp"))  # type: ignore[arg-type]
     for site in motions:
         site_topics = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
         for record in log[site].states:

@@ -23,7 +23,7 @@ from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
-from trilat_net.presentation.conclude import _tabulate_sites, conclude
+from trilat_net.presentation.conclusion import _tabulate_sites, conclude
 from trilat_net.presentation.page_summary import (
     describe_basis,
     find_error_peak,

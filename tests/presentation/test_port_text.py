@@ -6,7 +6,7 @@ import pytest
 
 from tests.theory.analysed_ports import section_of
 from trilat_net.analysis.theory.port_analysis import ports_to_json
-from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize, make_print_size
+from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize
 from trilat_net.presentation.figures.linear_figures import (
     draw_port_impedance,
     draw_port_passivity,
@@ -66,7 +66,7 @@ def test_facts_have_the_numbers_of_the_lines() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "form"), [("two_sites", make_print_size(3.5)), ("p_d_margin", REPORT_SIZE)]
+    ("name", "form"), [("two_sites", FigureSize.for_print(3.5)), ("p_d_margin", REPORT_SIZE)]
 )
 def test_figures_have_the_requested_width(name: str, form: FigureSize) -> None:
     for draw in (draw_port_impedance, draw_port_passivity):

@@ -14,7 +14,7 @@ from matplotlib.text import Text
 import trilat_net
 from tests.analysis import logs
 from trilat_net.errors import UsageError
-from trilat_net.presentation.appearance import COLUMN_IN, PAGE_IN, make_print_size
+from trilat_net.presentation.appearance import COLUMN_IN, PAGE_IN, FigureSize
 from trilat_net.presentation.figures import age_and_lateness, joint_motion
 from trilat_net.presentation.figures.registry import (
     FIGURES,
@@ -86,7 +86,7 @@ def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
     """252 pt are 3.5 in; Type 42 is TrueType, which journals accept, unlike Type 3."""
     before = dict(mpl.rcParams)
     path = tmp_path / f"{name}.pdf"
-    write_figure(draw_example(name, COLUMN_IN), path, make_print_size(COLUMN_IN).dpi)
+    write_figure(draw_example(name, COLUMN_IN), path, FigureSize.for_print(COLUMN_IN).dpi)
     assert dict(mpl.rcParams) == before
     data = path.read_bytes()
     (box,) = re.findall(rb"/MediaBox \[ ?([\d. ]+) ?\]", data)
@@ -104,7 +104,7 @@ def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
 def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
     first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
     for path in (first, second):
-        write_figure(figure(walled(), "contact"), path, make_print_size(COLUMN_IN).dpi)
+        write_figure(figure(walled(), "contact"), path, FigureSize.for_print(COLUMN_IN).dpi)
     assert first.read_bytes() == second.read_bytes()
     if kind == "png":
         assert int.from_bytes(first.read_bytes()[16:20], "big") == 2100  # 600 dots per inch

@@ -14,7 +14,7 @@ from tests.analysis import logs
 from tests.core.guarded_runs import stopped_log
 from trilat_net.analysis.link_summary import summarise_clock
 from trilat_net.core.step.site_setup import Layout
-from trilat_net.core.step.ticks import LifeReason, find_alarm
+from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.presentation import summary_text
 from trilat_net.presentation.page_summary import render_alarms
@@ -82,7 +82,7 @@ def test_stopped_arms_are_reported_first():
     ],
 )
 def test_alarms_say_what_to_do(mode, reason, advice):
-    alarm = find_alarm("x", "s", mode, [0.0, 0.0, 0.0, 0.0, 0.0, float(reason)], 2)
+    alarm = LifeAlarm.find("x", "s", mode, [0.0, 0.0, 0.0, 0.0, 0.0, float(reason)], 2)
     assert (alarm is None) == (advice is None)
     assert alarm is None or alarm.advice.endswith(advice)
 
@@ -91,15 +91,15 @@ def test_continuing_without_a_peer_is_reported():
     layout = Layout()
     mem = [0.0] * layout.count_life_memory(2) + [0.0, -1.0]
     assert layout.list_lost_peers(mem, ("m1", "m2")) == ["m2"]
-    alarm = find_alarm("x", "s", "run", mem, 2, layout.list_lost_peers(mem, ("m1", "m2")))
+    alarm = LifeAlarm.find("x", "s", "run", mem, 2, layout.list_lost_peers(mem, ("m1", "m2")))
     assert alarm.word == "WITHOUT m2"
-    assert find_alarm("x", "s", "fault", mem, 2, ["m2"]).word == "FAULT"
+    assert LifeAlarm.find("x", "s", "fault", mem, 2, ["m2"]).word == "FAULT"
     assert layout.list_lost_peers(mem[:4], ("m1", "m2")) == []
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 5, [0.0] * 5 + [1e9], [0.0] * 5 + [-1.0]])
 def test_foreign_records_raise_no_alarm(mem):
-    assert find_alarm("x", "s", "fault", mem, 2) is None
+    assert LifeAlarm.find("x", "s", "fault", mem, 2) is None
 
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):

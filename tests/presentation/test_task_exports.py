@@ -22,7 +22,6 @@ from tests.log_editing import edited, opened, recorded
 from tests.task_arms import planar_task
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import write_virtual_log
-from trilat_net.log.data_tables import to_data_frame
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 from trilat_net.presentation.export import Exporter
@@ -74,7 +73,7 @@ def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
     (table,) = (
         table_of_site for table_of_site in log().tables() if table_of_site.label == "m_state"
     )
-    frame = to_data_frame(table)
+    frame = table.to_data_frame()
     for field, heads in HEADS.items():
         wanted = getattr(log()["m"], field)
         assert np.array_equal(np.stack([site[head] for head in heads], axis=1), wanted)

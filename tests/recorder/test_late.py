@@ -9,7 +9,7 @@ from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION as REAL
 from tests.sites.sessions import Session, in_log, in_virtual_time
 from trilat_net.app.recorded_session import make_scenario_reader
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.provenance import collect_provenance

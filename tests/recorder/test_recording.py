@@ -16,7 +16,7 @@ from tests.sites.relay import Relay, RelayClock
 from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.provenance import collect_provenance

@@ -15,7 +15,7 @@ from tests.scenario.chains import SIX, six
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.resolve import SHIPPED_FOLDER

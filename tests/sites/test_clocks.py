@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.truth import judge_link, members, offset_errors
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario

@@ -27,7 +27,7 @@ from tests.scenario.chains import six
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics

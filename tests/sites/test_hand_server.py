@@ -15,7 +15,7 @@ from tests.net.manual_clock import ManualClock
 from trilat_net.app.running_session import open_hand
 from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
 from trilat_net.errors import UsageError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics

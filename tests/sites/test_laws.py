@@ -6,7 +6,7 @@ import pytest
 
 from sites.site_parts import warm_up
 from trilat_net.errors import LawFailed
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario

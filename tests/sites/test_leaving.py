@@ -11,8 +11,8 @@ from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.errors import PeerLeft, SessionError
-from trilat_net.execution.log_checks import run_log_checks
-from trilat_net.execution.verify import verify
+from trilat_net.execution.log_checks import LogCheckReport
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.session_check import check_file
@@ -50,7 +50,7 @@ def test_killed_sites_return_and_logs_are_whole(tmp_path: Path) -> None:
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     assert result.passed
     assert result.absences == [("m", *log.absences["m"][0])]
-    assert run_log_checks(log, virtual=True).passed
+    assert LogCheckReport.of_log(log, virtual=True).passed
 
 
 def kinds_about(log: Log, member: str, about: str) -> list[str]:

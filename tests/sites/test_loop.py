@@ -12,7 +12,7 @@ from tests.net.manual_clock import ManualClock
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import SessionError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus

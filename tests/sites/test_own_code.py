@@ -10,7 +10,7 @@ from sites.hand_process import HandProcess
 from tests.own_code import Circle, Failing, Follower
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
@@ -18,7 +18,7 @@ from trilat_net.net.requests import HandMessage
 from trilat_net.net.topics import HAND, key
 from trilat_net.net.wire import encode
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.program_hand import HandSite, find_own_hand
+from trilat_net.scenario.operators.program_hand import HandSite
 
 from .relay import RelayClock
 from .sessions import SESSION, Session
@@ -36,7 +36,7 @@ def at_m2(kind: str, **keys: Any) -> Scenario:
 
 def begin(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
     """Returns a session whose hand at m2 runs in a process of its own."""
-    at = find_own_hand(scenario, "m2")
+    at = HandSite.find(scenario, "m2")
     assert at is not None
     return at, Session.whole(scenario, folder)
 
@@ -58,7 +58,7 @@ def add_program(
     """Adds a program at m2 in a process of its own, which computes for a time over each view."""
 
     def run(clock: RelayClock) -> None:
-        at = find_own_hand(session.scenario, "m2")
+        at = HandSite.find(session.scenario, "m2")
         assert at is not None
         thinking = Thinking(program, clock, thinks_ns)
         with HandProcess(at, thinking, session.network.join(), clock, SESSION) as hand:

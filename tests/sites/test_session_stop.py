@@ -15,7 +15,7 @@ from tests.net.manual_clock import ManualClock
 from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 

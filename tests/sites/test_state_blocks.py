@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.chains import six_joints
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox

@@ -9,7 +9,7 @@ import pytest
 
 from tests.log.disks import SmallDisk, file_on
 from trilat_net.errors import LogRefused
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log import log_writer
 from trilat_net.log.log_layout import ChannelFilter, active_path, find_parts
 from trilat_net.log.log_reader import open_log

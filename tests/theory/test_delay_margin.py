@@ -16,7 +16,7 @@ from trilat_net.analysis.theory.delay_margin import (
     set_common_delay,
 )
 from trilat_net.analysis.theory.linear_loop import linearise_loop
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import load_scenario
 
 
@@ -78,7 +78,7 @@ def test_roots_at_zero_cross_nothing() -> None:
     scenario = load_scenario("free")
     margin = find_delay_margin(
         linearise_loop(
-            derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.1236, 0.3373))
+            OperatingConditions.derive(scenario), find_equilibrium(scenario, (-0.1236, 0.3373))
         )
     )
     assert margin.description == "stable for every common delay up to 10 s"
@@ -88,7 +88,7 @@ def test_force_reflection_in_contact_has_a_margin() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
     margin = find_delay_margin(
-        linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario))
+        linearise_loop(OperatingConditions.derive(scenario), find_equilibrium(scenario))
     )
     (span,) = margin.intervals
     assert 0.02 < span.high_s < 0.2

@@ -10,7 +10,7 @@ from trilat_net.analysis.theory.equilibrium import (
     follow_equilibrium,
     predict_equilibrium,
 )
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 
@@ -24,7 +24,7 @@ def test_a_rest_is_an_equilibrium(name: str) -> None:
     scenario = load_scenario(name, TRIO)
     equilibrium = find_equilibrium(scenario)
     assert np.abs(
-        compute_equilibrium_residual(derive_operating_conditions(scenario), equilibrium)
+        compute_equilibrium_residual(OperatingConditions.derive(scenario), equilibrium)
     ).max() == pytest.approx(equilibrium.residual, abs=1e-14)
     assert equilibrium.residual <= MAX_EQUILIBRIUM_RESIDUAL
 
@@ -63,7 +63,7 @@ def test_hammering_runs_have_a_contact_equilibrium() -> None:
     scenario = load_scenario("contact", {**TRIO, "rate_hz": 500})
     equilibrium = find_equilibrium(scenario)
     assert "still moves" in equilibrium.how
-    now = derive_operating_conditions(scenario)
+    now = OperatingConditions.derive(scenario)
     # settles at the same pose
     calm = find_equilibrium(load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0}))
     assert "at rest" in calm.how

@@ -17,7 +17,7 @@ from trilat_net.analysis.theory.floquet import (
     compute_sampled_spectrum,
     find_samples_in_use,
 )
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.sample_uses import draw_used_samples
@@ -48,7 +48,7 @@ def at_rest(
         scenario, starts | {f"sites.{site}.hands": [] for site in scenario.names}
     )
     spectrum = compute_sampled_spectrum(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, pose), wanted
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, pose), wanted
     )
     assert spectrum is not None
     return Loop(scenario, spectrum)
@@ -194,7 +194,7 @@ def test_one_rate_gives_companion_matrix_eigenvalues(
         "two_sites", {"rate_hz": 100, "control": {**law, **damped}, "link.delay_ms": delay_ms}
     )
     recursion = build_recursion(
-        derive_operating_conditions(loop.scenario), find_equilibrium(loop.scenario, POSE)
+        OperatingConditions.derive(loop.scenario), find_equilibrium(loop.scenario, POSE)
     )
     roots = recursion.roots(100)
     still = np.abs(roots) < 1e-6
@@ -247,7 +247,7 @@ def test_the_period_is_that_of_the_draws(period_s: float) -> None:
         "sites.s.rate_hz": 150,
         "link": {**SINE, "period_s": period_s},
     }
-    conditions = derive_operating_conditions(load_scenario("two_sites", changes))
+    conditions = OperatingConditions.derive(load_scenario("two_sites", changes))
     uses = find_samples_in_use(conditions)
     assert uses.period_s is not None
     for (i, j), (link, key) in conditions.links.items():
@@ -306,7 +306,7 @@ def test_thousandfold_growth_per_tick_has_its_root() -> None:
         1,
     )
     recursion = build_recursion(
-        derive_operating_conditions(loop.scenario), find_equilibrium(loop.scenario, POSE)
+        OperatingConditions.derive(loop.scenario), find_equilibrium(loop.scenario, POSE)
     )
     assert loop.growth_per_s == pytest.approx(recursion.roots(1000)[0].real, rel=1e-9)
     assert loop.growth_per_s > 6e3

@@ -20,7 +20,7 @@ from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.analysis.theory.port_response import clamp_site, evaluate_transfer
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
@@ -33,7 +33,7 @@ HELD = {**CLAMP, "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 10.0}
 
 def loop_of(scenario: Scenario) -> LinearLoop:
     return linearise_loop(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, (0.0, 0.0))
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.0, 0.0))
     )
 
 
@@ -277,7 +277,7 @@ def test_lines_hold_arms_at_rest_against_hands() -> None:
         "two_sites", {"control.law": "wave", "scheme": "digital", **follows}
     )
     loop = linearise_loop(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, (0.4, 1.2))
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.4, 1.2))
     )
     assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1
 

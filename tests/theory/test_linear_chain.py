@@ -19,11 +19,7 @@ from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import predict_equilibrium
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
 from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.analysis.theory.operating_point import (
-    Equilibrium,
-    OperatingConditions,
-    derive_operating_conditions,
-)
+from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import analyse_ports, linearise_teleoperator
 from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.analysis.theory.site_dynamics import (
@@ -98,7 +94,7 @@ def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
     learns = {"control": {**LAWS[law], "theta_hat0": theta}} if law == "adaptive" else {}
     scenario = parse_scenario(TEXT, "six", keys | overrides | learns, ARMS)
     return Linear(
-        scenario, derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+        scenario, OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
 
 

@@ -21,8 +21,8 @@ from trilat_net.analysis.theory import (
 from trilat_net.analysis.theory.equilibrium import predict_equilibrium
 from trilat_net.analysis.theory.linear_edge import (
     ASSUMED_EQUILIBRIUM_REMARK,
+    GrowthColumn,
     LinearEdge,
-    compute_growth_column,
     find_root_crossings,
 )
 from trilat_net.core.arms.two_link_arm import inertia
@@ -175,7 +175,7 @@ def damped(d: float) -> Scenario:
 
 
 def test_the_real_part_is_that_of_the_analysis() -> None:
-    growth_rates, _, remarks = compute_growth_column([damped(d) for d in D], "control.d", D)
+    growth_rates, _, remarks = GrowthColumn.compute([damped(d) for d in D], "control.d", D)
     assert remarks == []
     for d, growth in zip(D, growth_rates, strict=True):
         root = analyse_linear_loop(
@@ -190,9 +190,7 @@ def test_an_edge_is_where_the_sign_changes() -> None:
     (crossing,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
     assert remark == ""
     places = (crossing - 1e-4, crossing + 1e-4)
-    (below, above), edges, _ = compute_growth_column(
-        [*map(damped, places)], "control.d", places
-    )
+    (below, above), edges, _ = GrowthColumn.compute([*map(damped, places)], "control.d", places)
     assert below > 0.0 > above
     assert edges == {0: pytest.approx(crossing, rel=1e-6)}
     alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
@@ -207,7 +205,7 @@ def test_the_scheme_decides_the_loop() -> None:
         load_scenario("free", {**slow, "scheme": scheme})
         for scheme in ("second_order", "digital")
     ]
-    columns = [compute_growth_column([one], "link.delay_ms", (0.0,)) for one in schemes]
+    columns = [GrowthColumn.compute([one], "link.delay_ms", (0.0,)) for one in schemes]
     (continuous,), (digital,) = (column.growth_per_s for column in columns)
     assert continuous < 0.0 < digital
     assert columns[0].remarks == columns[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
@@ -215,7 +213,7 @@ def test_the_scheme_decides_the_loop() -> None:
 
 def test_nonlinear_loops_are_reported_as_unknown() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
-    growth_rates, edges, remarks = compute_growth_column(
+    growth_rates, edges, remarks = GrowthColumn.compute(
         [unknown, damped(3.0)], "control.d", (2.9, 3.0)
     )
     assert edges == {}

@@ -13,7 +13,7 @@ from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectr
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import follow_equilibrium
 from trilat_net.analysis.theory.linear_loop import linearise_loop
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.ticks import BUCKETS_PER_S
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
@@ -25,7 +25,7 @@ def rightmost(overrides: dict[str, float]) -> complex:
     """Returns the rightmost root of `free`."""
     scenario = load_scenario("free", overrides)
     root = compute_delay_spectrum(
-        linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario)), 1
+        linearise_loop(OperatingConditions.derive(scenario), find_equilibrium(scenario)), 1
     ).rightmost
     assert root is not None
     return root.s
@@ -34,7 +34,7 @@ def rightmost(overrides: dict[str, float]) -> complex:
 def test_states_and_inputs_follow_the_scenarios_order() -> None:
     scenario = load_scenario("contact")
     linear_loop = linearise_loop(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8))
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, (-0.6, 1.8))
     )
     assert linear_loop.names == (
         "m.q1",
@@ -59,7 +59,7 @@ def test_states_and_inputs_follow_the_scenarios_order() -> None:
 def test_adaptive_sites_have_estimates_as_states() -> None:
     scenario = load_scenario("two_sites")
     names = linearise_loop(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, (0.1, 0.2))
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.1, 0.2))
     ).names
     assert names[:9] == (
         "m.q1",
@@ -73,12 +73,12 @@ def test_adaptive_sites_have_estimates_as_states() -> None:
 def test_links_of_different_delays_have_an_entry_each() -> None:
     scenario = load_scenario("free", {"links.m1->s.delay_ms": 50.0})
     linear_loop = linearise_loop(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
     assert [delayed.delay_s for delayed in linear_loop.delayed] == [0.05, 0.2]
     both = linear_loop.delayed[0].A + linear_loop.delayed[1].A
     alike = linearise_loop(
-        derive_operating_conditions(load_scenario("free")),
+        OperatingConditions.derive(load_scenario("free")),
         find_equilibrium(load_scenario("free"), POSE),
     )
     assert both == pytest.approx(alike.delayed[0].A)
@@ -99,7 +99,7 @@ def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
 def test_zero_delay_is_the_one_tick_limit() -> None:
     scenario = load_scenario("free", {"link.delay_ms": 0.0})
     linear_loop = linearise_loop(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
     tick, none = (
         compute_delay_spectrum(set_common_delay(linear_loop, T), 1).roots[0].s
@@ -146,7 +146,7 @@ def test_unstable_rests_are_left_for_others() -> None:
     late = load_scenario("paper", begun)
     root = (
         compute_delay_spectrum(
-            linearise_loop(derive_operating_conditions(late), follow_equilibrium(late, rest)), 1
+            linearise_loop(OperatingConditions.derive(late), follow_equilibrium(late, rest)), 1
         )
         .roots[0]
         .s

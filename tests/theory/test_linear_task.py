@@ -22,7 +22,7 @@ from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_mean_pose
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
 from trilat_net.analysis.theory.linear_loop import linearise_loop
-from trilat_net.analysis.theory.operating_point import Equilibrium, derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import analyse_ports, linearise_teleoperator
 from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.errors import ScenarioError, UsageError
@@ -102,7 +102,7 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
     for space in ("joints", "position"):
         scenario = cartesian(law, space)
         rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
-        conditions = derive_operating_conditions(scenario)
+        conditions = OperatingConditions.derive(scenario)
         loop = linearise_loop(conditions, rest)
         spectrum = compute_delay_spectrum(loop, 12)
         sampled = compute_sampled_spectrum(conditions, rest, 12)
@@ -198,7 +198,7 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
         for n in range(n)
     ]
     off = {angle: size * rng.normal() for angle in angles}
-    whole, names, late, _ = build_recursion(derive_operating_conditions(scenario), rest)
+    whole, names, late, _ = build_recursion(OperatingConditions.derive(scenario), rest)
     start = np.array([off.get(name, 0.0) for name in names])
     X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // len(late))])
     learnt, torques = (
@@ -218,7 +218,7 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
 def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     """Started along the vector of each of the three rightmost roots that swing."""
     scenario, rest = settled(name)
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
     spectrum = compute_sampled_spectrum(conditions, rest, 14)
     assert spectrum is not None

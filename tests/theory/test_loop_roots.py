@@ -13,7 +13,7 @@ import trilat_net as tn
 from tests.virtual_runs import simulate_with_commands
 from trilat_net.analysis.delay_period import find_burst_interval_s, find_final_delay_period
 from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.run_end import classify_log_end
+from trilat_net.analysis.run_end import RunEnd
 from trilat_net.analysis.theory.loop_roots import (
     find_log_roots,
     find_run_roots,
@@ -186,7 +186,7 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     plain = tn.simulate(scenario)
     assert log.changes("s")
     assert list_effective_commands(log) == []
-    assert classify_log_end(log) == classify_log_end(plain)
+    assert RunEnd.of_log(log) == RunEnd.of_log(plain)
     assert find_log_roots(log) == find_log_roots(plain)
     assert certify_run(log).decision == certify_run(plain).decision
 

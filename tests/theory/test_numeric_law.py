@@ -16,7 +16,7 @@ from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.equilibrium import find_equilibrium, follow_equilibrium
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
 from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.vectors import Array
 from trilat_net.errors import ScenarioError
 
@@ -81,8 +81,8 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     rest = find_equilibrium(ours, POSE)
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
-    roots_of_memory = roots(compute_sampled_spectrum(derive_operating_conditions(theirs), same))
-    known = roots(compute_sampled_spectrum(derive_operating_conditions(ours), rest))
+    roots_of_memory = roots(compute_sampled_spectrum(OperatingConditions.derive(theirs), same))
+    known = roots(compute_sampled_spectrum(OperatingConditions.derive(ours), rest))
     same_bits = scheme == "second_order"
     assert np.allclose(
         roots_of_memory[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory.equilibrium import extend_scenario
 from trilat_net.analysis.theory.operating_point import (
+    OperatingConditions,
     compute_effective_delay,
-    derive_operating_conditions,
 )
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 
 
 def test_shares_and_links_are_those_at_the_end() -> None:
-    conditions = derive_operating_conditions(load_scenario("training"))
+    conditions = OperatingConditions.derive(load_scenario("training"))
     assert conditions.alpha.sum(axis=1) == pytest.approx(1.0)
     row = dict(
         zip(conditions.names, conditions.alpha[conditions.names.index("s")], strict=True)
@@ -28,20 +28,20 @@ def test_shares_and_links_are_those_at_the_end() -> None:
     assert any(
         "the dominance factors of s change during the run" in note for note in conditions.notes
     )
-    half = derive_operating_conditions(load_scenario("training", {"duration_s": 11.0}))
+    half = OperatingConditions.derive(load_scenario("training", {"duration_s": 11.0}))
     assert half.alpha[half.names.index("s"), 0] == pytest.approx(0.5)
 
 
 def test_only_holding_hands_enter_operating_points() -> None:
     assert not any(
-        site.actors for site in derive_operating_conditions(load_scenario("paper")).sites
+        site.actors for site in OperatingConditions.derive(load_scenario("paper")).sites
     )
-    pushed = derive_operating_conditions(load_scenario("paper", {"duration_s": 3.5}))
+    pushed = OperatingConditions.derive(load_scenario("paper", {"duration_s": 3.5}))
     (pulse,) = pushed.sites[0].actors
     assert pulse.a == pytest.approx((10.0, 10.0))  # its peak, at 3.5 s
     assert any("a scripted torque acts on m1 at the end" in note for note in pushed.notes)
-    assert len(derive_operating_conditions(load_scenario("contact")).sites[0].actors) == 1
-    moving = derive_operating_conditions(load_scenario("contact", {"duration_s": 2.0}))
+    assert len(OperatingConditions.derive(load_scenario("contact")).sites[0].actors) == 1
+    moving = OperatingConditions.derive(load_scenario("contact", {"duration_s": 2.0}))
     assert any("still moves at the end" in note for note in moving.notes)
 
 
@@ -52,14 +52,14 @@ def test_only_constant_recorded_torques_stay() -> None:
     ]
     swings = {"kind": "multisine", "amplitude_nm": [1.0, 0.0], "frequencies_hz": [1.0]}
     scenario = load_scenario("free", {"sites.m1.hands": [*recorded, swings]})
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     assert [actor.a for actor in conditions.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
     assert any("still swings at the end" in note for note in conditions.notes)
     assert len(extend_scenario(scenario, 100.0).sites["m1"].hands) == 2
 
 
 def test_varying_quantities_have_their_mean() -> None:
-    conditions = derive_operating_conditions(load_scenario("jitter", {"duration_s": 5.0}))
+    conditions = OperatingConditions.derive(load_scenario("jitter", {"duration_s": 5.0}))
     assert conditions.age_s[0, 1] == pytest.approx(0.025, rel=0.1)
     assert any("linearised at the mean of each" in note for note in conditions.notes)
 
@@ -79,7 +79,7 @@ def test_loops_without_linear_form_are_refused(
     overrides: dict[str, object], facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as refused:
-        derive_operating_conditions(load_scenario("two_sites", overrides))
+        OperatingConditions.derive(load_scenario("two_sites", overrides))
     assert all(fact in str(refused.value) for fact in ["two_sites", *facts])
 
 
@@ -87,11 +87,11 @@ def test_continuing_runs_change_nothing() -> None:
     longer = extend_scenario(load_scenario("training", {"duration_s": 5.0}), 50.0)
     assert longer.duration_s == 50.0
     assert longer.timeline == ()
-    conditions = derive_operating_conditions(longer)
+    conditions = OperatingConditions.derive(longer)
     assert [len(site.actors) for site in conditions.sites] == [1, 1, 0]
     assert np.array_equal(
         conditions.alpha,
-        derive_operating_conditions(load_scenario("training", {"duration_s": 5.0})).alpha,
+        OperatingConditions.derive(load_scenario("training", {"duration_s": 5.0})).alpha,
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from tests.theory.networks import Array, Complex, hold_by_spring
 from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.analysis.theory.port_analysis import linearise_teleoperator
 from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.scenario import load_scenario
@@ -58,7 +58,7 @@ def test_p_d_answers_sinusoids_by_its_admittance(hz: float, joint: int) -> None:
     scenario = load_scenario("p_d_margin_two", overrides)
     Y = build_admittance(
         linearise_teleoperator(
-            derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+            OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
         )
     )(np.array([2.0 * np.pi * hz]))[0]
     admittance = measure_admittance("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
@@ -88,7 +88,7 @@ def test_paper_law_answers_by_its_admittance(hz: float) -> None:
         "two_sites", {**overrides, "sites.m.hands": [], "sites.s.hands": []}
     )
     bare = linearise_teleoperator(
-        derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+        OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
     Y = build_admittance(hold_by_spring(bare, "m", 20.0, 3.0))(np.array([2.0 * np.pi * hz]))[0]
     admittance = measure_admittance(

@@ -8,11 +8,7 @@ from tests.theory.networks import hold_by_spring
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_frequencies
 from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.analysis.theory.operating_point import (
-    Equilibrium,
-    OperatingConditions,
-    derive_operating_conditions,
-)
+from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import (
     build_proof_output,
     compute_proof_weights,
@@ -46,7 +42,7 @@ def at_pose(
     name: str, overrides: Mapping[str, Any] | None = None
 ) -> tuple[Scenario, OperatingConditions, Equilibrium, LinearLoop]:
     scenario = load_scenario(name, dict(overrides or {}))
-    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     return scenario, now, rest, linearise_teleoperator(now, rest)
 
 
@@ -81,10 +77,10 @@ def test_hands_at_ports_restore_their_loop() -> None:
         "training", {**BARE, "sites.m1.hands": [hand], "sites.s.environment": [dashpot]}
     )
     rest = find_equilibrium(scenario)
-    bare = linearise_teleoperator(derive_operating_conditions(scenario), rest)
+    bare = linearise_teleoperator(OperatingConditions.derive(scenario), rest)
     again, whole = (
         hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7),
-        linearise_loop(derive_operating_conditions(scenario), rest),
+        linearise_loop(OperatingConditions.derive(scenario), rest),
     )
     np.testing.assert_allclose(again.A, whole.A, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(again.B, whole.B)
@@ -98,9 +94,9 @@ def test_reflected_force_includes_that_of_loads() -> None:
         "contact", {"sites.m.hands": [], "sites.s.environment": [], "sites.s.hands": [hand]}
     )
     rest = find_equilibrium(scenario, POSE)
-    bare = linearise_teleoperator(derive_operating_conditions(scenario), rest)
+    bare = linearise_teleoperator(OperatingConditions.derive(scenario), rest)
     again = hold_by_spring(bare, "s", 50.0, 4.0)
-    whole = linearise_loop(derive_operating_conditions(scenario), rest)
+    whole = linearise_loop(OperatingConditions.derive(scenario), rest)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
         np.testing.assert_allclose(a.A, b.A, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(a.B, b.B)
@@ -109,7 +105,7 @@ def test_reflected_force_includes_that_of_loads() -> None:
 def test_torques_at_rest_continue_to_act() -> None:
     scenario = load_scenario("training")
     off = freeze_external_torques(
-        derive_operating_conditions(scenario), find_equilibrium(scenario)
+        OperatingConditions.derive(scenario), find_equilibrium(scenario)
     )
     pushes = [site.actors[0].a for site in off.sites if site.actors]
     assert len(pushes) == 2

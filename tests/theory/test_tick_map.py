@@ -17,7 +17,7 @@ from trilat_net.analysis.theory.floquet import (
     discretise_zero_order_hold,
 )
 from trilat_net.analysis.theory.linear_loop import linearise_loop
-from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario
 
 POSE = (-0.1729, 0.0874)
@@ -25,7 +25,7 @@ POSE = (-0.1729, 0.0874)
 
 def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
     """Returns the continuous and the sampled spectrum, about one pose."""
-    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
     spectrum = compute_sampled_spectrum(now, rest, wanted)
     assert spectrum is not None
@@ -89,7 +89,7 @@ def test_small_deviations_follow_runs_tick_by_tick(
             "sites.s.q0_rad": (pose + off[1]).tolist(),
         },
     )
-    now = derive_operating_conditions(scenario)
+    now = OperatingConditions.derive(scenario)
     rest = find_equilibrium(scenario, pose)
     assert rest.residual < 1e-10
     whole, names, late, _ = build_recursion(now, rest)
@@ -180,7 +180,7 @@ def test_a_growing_swing_matches_a_run() -> None:
             "sites.s.q0_rad": [0.3, 0.0],
         },
     )
-    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3005, 0.0))
+    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.3005, 0.0))
     spectrum = compute_sampled_spectrum(now, rest, 2)
     assert spectrum is not None
     root = spectrum.roots[0].s

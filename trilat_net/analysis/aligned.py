@@ -22,17 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.task_space import POSE, POSITION
-from ..core.life.safeguards import BLEND_S
-from ..core.step.ticks import NS_PER_S
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.orientations import choose_nearest_vectors
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog, compute_task_errors
-from ..net.messages import RESTING_MODES, TASK_VECTORS
-from ..scenario import Scenario
-from ..scenario.scenario_types import Limits
+from ..core import BLEND_S, POSE, POSITION, Array
+from ..log import Ints, Log, SiteLog, choose_nearest_vectors, compute_task_errors
+from ..net import RESTING_MODES, TASK_VECTORS
+from ..records import NS_PER_S
+from ..scenario import Limits, Scenario
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")

@@ -27,13 +27,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.chain import (
+from ..core import (
     COULOMB_SPEED,
     LINK_PARAMETERS,
-    MAX_JOINTS,
+    Array,
+    ChainSetup,
+    Row,
+    RowArray,
+    TaskSetup,
     build_chain,
     dot,
+    forward_kinematics,
     inverse_dynamics,
+    leaf,
     parameter_gradient,
     place_end_effector,
     place_joints,
@@ -41,12 +47,8 @@ from ..core.arms.chain import (
     rotate,
     three,
 )
-from ..core.arms.two_link_arm import JOINTS, forward_kinematics
-from ..core.step.jit import leaf
-from ..core.step.site_setup import ChainSetup, TaskSetup
-from ..core.step.vectors import Array, Row, RowArray
-from ..scenario import Scenario
-from ..scenario.arms import ArmModel
+from ..records import JOINTS, MAX_JOINTS
+from ..scenario import ArmModel, Scenario
 
 HANGING_RAD = 0.3
 """Largest angle to straight down of a link that hangs, in rad."""

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.arms.task_space import POSITION
-from ..core.step.vectors import Array
-from ..log.orientations import QUATERNION_AXES, QuaternionSigns
+from ..core import POSITION, Array
+from ..log import QUATERNION_AXES, QuaternionSigns
 
 
 class BodyTurns:

@@ -19,9 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.links.delay import DelayKind, TraceEnd
-from ..scenario.delay_models import LinkBase
-from ..scenario.scenario_types import Scenario, scheduled_links
+from ..core import DelayKind, TraceEnd
+from ..scenario import LinkBase, Scenario, scheduled_links
 
 MAX_PERIOD_TICKS = 400_000
 """Longest true period that is analysed, in ticks of the fastest site."""

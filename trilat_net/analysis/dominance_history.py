@@ -22,15 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.life.live_hand import TAKEN
-from ..core.links.dominance import find_reach, perron_vector
-from ..core.step.ticks import DominanceRamp
-from ..core.step.vectors import Array
+from ..core import TAKEN, Array, DominanceRamp, find_reach, perron_vector
 from ..errors import UsageError
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..scenario import Scenario
-from ..scenario.operators.program_hand import POLICY, ProgramHand
+from ..log import Ints, Log
+from ..scenario import POLICY, ProgramHand, Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
 """Half of the nanosecond to which the starts and ends of ramps are rounded, in s."""
@@ -440,6 +435,22 @@ def evaluate_ramps(
     rate_left = rate[:-1]
     at_period_ends = alpha_left + h_s * rate_left
     return DominanceHistory(alpha, rate, at_period_ends)
+
+
+def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
+    """Returns the dominance factors of a site over time, as the scenario plans them.
+
+    Args:
+        scenario: The description of the experiment.
+        site: Name of the site.
+        t_s: Ascending times, shape (K,), in s.
+
+    Returns:
+        Factors with which the site follows its P peers, shape (K, P).
+    """
+    start, ramps = list_scripted_ramps(scenario, site)
+    period_s = 1.0 / scenario.sites[site].rate_hz
+    return evaluate_ramps(start, ramps, t_s, period_s).alpha
 
 
 KD_SHAPE_TOLERANCE = 1e-9

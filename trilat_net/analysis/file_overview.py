@@ -23,19 +23,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.step.ticks import NS_PER_S
 from ..errors import LogError, count_nouns
 from ..files import reading
-from ..log.accounting import Account
-from ..log.log_layout import SESSION
-from ..log.log_reader import Log, open_log
-from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
-from ..log.site_log import SiteLog
-from ..net import topics
-from ..net.topics import count_messages, number_message
+from ..log import (
+    SESSION,
+    Account,
+    ChannelInfo,
+    Log,
+    McapReader,
+    Progress,
+    SiteLog,
+    open_log,
+    shift_progress,
+)
+from ..net import count_messages, number_message, topics
+from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
-from ..scenario.describe import list_arm_notes
-from ..scenario.expect import END_WINDOW_S
+from ..scenario import END_WINDOW_S, list_arm_notes
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
     LinkSummary,

@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.step.vectors import Array
-from ..log.record_columns import Ints
+from ..core import Array
+from ..log import Ints
 from .arm_rows import ArmRows, Numbers, PlanarArmRows, multiply_columns
 
 Rows = slice | Ints

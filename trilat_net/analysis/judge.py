@@ -15,17 +15,14 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..execution.fused import FusedRun
-from ..execution.virtual import simulate_scenario
-from ..log.accounting import MIN_COVERAGE
-from ..log.log_reader import Log
-from ..scenario import Scenario
-from ..scenario.describe import describe_law_conditions, list_law_situations
+from ..execution import FusedRun, simulate_scenario
+from ..log import MIN_COVERAGE, Log
+from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import find_missing_functionals
 from .certificate.stability_certificate import Certificate, certify
 from .delay_period import find_final_link
-from .run_end import RunEnd, RunTrace, Stability, classify_run_end
+from .run_end import RunEnd, RunTrace, Stability
 from .run_remarks import list_remarks
 from .stability_decision import (
     LoopRoots,
@@ -36,7 +33,7 @@ from .stability_decision import (
 )
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from .theory.operating_point import has_lasting_delays
-from .twins.twin_growth import TwinGrowth, measure_twins, measure_virtual_twins
+from .twins.twin_growth import TwinGrowth
 
 
 def list_law_proofs(scenario: Scenario) -> list[str]:
@@ -90,7 +87,7 @@ def certify_run(
     certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
     growth = None
     if twins != 0:
-        growth = measure_twins(log, certificate.end, twins, own_laws=own_laws)
+        growth = TwinGrowth.of_log(log, certificate.end, twins, own_laws=own_laws)
     final_scenario = resolve_final_scenario(log)
     roots = find_log_roots(log, own_laws=own_laws)
     conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
@@ -148,7 +145,7 @@ def judge_virtual_run(
         ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     if end is None:
         trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-        end = classify_run_end(ended, trace)
+        end = trace.classify_end(ended)
     findings = RunFindings(
         end=end,
         roots=find_run_roots(ended, run),
@@ -156,7 +153,7 @@ def judge_virtual_run(
     )
     twins = None
     if not is_decided_by_roots(findings):
-        twins = measure_virtual_twins(ended, end, run.ran_s)
+        twins = TwinGrowth.of_scenario(ended, end, run.ran_s)
         findings = findings._replace(twins=twins)
     decision = decide_stability(findings)
     is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)

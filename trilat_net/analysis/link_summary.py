@@ -23,15 +23,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.links.channel import LOST
-from ..core.links.delay import DelayKind
-from ..core.links.link import AHEAD_LIMIT_NS
-from ..core.step.ticks import NS_PER_S
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
-from ..scenario.sample_uses import LinkSchedule, first_ticks
+from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind
+from ..log import Ints, Log, SiteLog
+from ..records import NS_PER_S
+from ..scenario import LinkSchedule, first_ticks
 from .aligned import Bools
 from .timeline import StatedModel, list_changes, list_stated_models
 

@@ -30,13 +30,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
-from ..core.links.dominance import find_reach
-from ..core.step.ticks import BUCKETS_PER_S
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
+from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, TorqueKind, find_reach
+from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
 from .site_signals import SETTLED_ERROR_RAD, find_last_error
@@ -267,6 +262,27 @@ class RunEnd(NamedTuple):
         rates = f"|e| {self.error.rate_text}, |qd| {self.speed.rate_text}"
         return f"{behaviour.value}{joint} ({rates}): {end}"
 
+    @classmethod
+    def of_log(cls, log: Log) -> "RunEnd":
+        """Judges from a log whether the motion died away at the end of the run.
+
+        A log that is torn or empty leaves the end undecided. If the run ends in a bounded
+        oscillation, its frequency is computed too.
+
+        Args:
+            log: The log of the run.
+        """
+        end = trace_log(log).classify_end(log.scenario)
+        error = find_last_error(log)
+        if error is not None:
+            end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
+        if end.behaviour is EndBehaviour.DIVERGED:
+            return end._replace(divergence=log.describe_divergence())
+        if end.behaviour is not EndBehaviour.BOUNDED:
+            return end
+        parts = [log[site] for site in log.sites]
+        return end._replace(frequency_hz=_find_frequency_hz(parts))
+
 
 class RunTrace(NamedTuple):
     """The reduced data from which the end of a run is judged, per site in scenario order.
@@ -294,6 +310,67 @@ class RunTrace(NamedTuple):
     diverged_at_s: float | None = None
     pushed_until_s: float = 0.0
     changed_until_s: float = 0.0
+
+    def classify_end(self, scenario: Scenario) -> RunEnd:
+        """Judges from reduced data whether the motion died away at the end of a run.
+
+        The worst joint of all sites decides. A run that is stable by the trends of its joints
+        is left open if its sites do not agree, if arms fell, or if the control loop changed
+        until shortly before the end.
+
+        Args:
+            scenario: The description of the experiment.
+        """
+        sites = _split_buckets(scenario, self)
+        # the last interval may be incomplete
+        count = max(min(map(len, sites)) - 1, 0)
+        recorded_by_site = [site[:count, 0, 0] >= 0.0 for site in sites]
+        recorded = np.all(recorded_by_site, axis=0)
+        rows = np.flatnonzero(recorded)
+        span_s = count / BUCKETS_PER_S
+        all_t_s = rows / BUCKETS_PER_S
+
+        acted_s = max(self.pushed_until_s, _find_last_operator_action(scenario, span_s))
+        changed_s = max(self.changed_until_s, _find_last_change(scenario, span_s))
+        quiet_from_s = max(acted_s, changed_s)
+        first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
+        _, operator_disturbs = _choose_judged_part(all_t_s, acted_s)
+        operator_acts = is_disturbed and operator_disturbs
+        t_s = all_t_s[first:]
+        judged_rows = rows[first:]
+        columns = [site[judged_rows] for site in sites]
+
+        worst = _find_worst_joint(scenario, t_s, columns, sites)
+        missing = []
+        for name, data in zip(scenario.names, sites, strict=True):
+            if not len(data):
+                missing.append(name)
+        end = worst._replace(
+            missing_sites=tuple(missing),
+            counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
+            quiet_from_s=quiet_from_s,
+            lasts_s=span_s,
+        )
+        first_site = scenario.sites[scenario.names[0]]
+        if first_site.task.space == "position":
+            end = end._replace(error_unit="m")
+
+        if self.diverged_at_s is not None:
+            return end._replace(
+                behaviour=EndBehaviour.DIVERGED, diverged_at_s=self.diverged_at_s
+            )
+        if end.behaviour.stability is Stability.SETTLED:
+            reasons = list(_find_disagreement(scenario, self, t_s, columns))
+            reasons += _find_odd_pose(scenario, sites)
+            if is_disturbed and not operator_acts:
+                reasons.append(
+                    f"the loop changes until {changed_s:.4g} s, within the judged part"
+                )
+            return end._replace(reasons=tuple(reasons))
+        if operator_acts:
+            reason = f"an operator acts until {acted_s:.4g} s, within the judged part"
+            return end._replace(operator_acts=True, reasons=(reason,))
+        return end
 
 
 NO_BUCKETS = np.zeros((0, 3))
@@ -406,86 +483,6 @@ def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
     if len(part) and part.layout.hand:
         pushed |= part.hand[:, 0] > 0.0
     return float(part.t_s[pushed].max(initial=0.0))
-
-
-def classify_log_end(log: Log) -> RunEnd:
-    """Judges from a log whether the motion died away at the end of the run.
-
-    A log that is torn or empty leaves the end undecided. If the run ends in a bounded
-    oscillation, its frequency is computed too.
-
-    Args:
-        log: The log of the run.
-    """
-    end = classify_run_end(log.scenario, trace_log(log))
-    error = find_last_error(log)
-    if error is not None:
-        end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
-    if end.behaviour is EndBehaviour.DIVERGED:
-        return end._replace(divergence=log.describe_divergence())
-    if end.behaviour is not EndBehaviour.BOUNDED:
-        return end
-    parts = [log[site] for site in log.sites]
-    return end._replace(frequency_hz=_find_frequency_hz(parts))
-
-
-def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
-    """Judges from reduced data whether the motion died away at the end of a run.
-
-    The worst joint of all sites decides. A run that is stable by the trends of its joints is
-    left open if its sites do not agree, if arms fell, or if the control loop changed until
-    shortly before the end.
-
-    Args:
-        scenario: The description of the experiment.
-        trace: The reduced data of the run.
-    """
-    sites = _split_buckets(scenario, trace)
-    # the last interval may be incomplete
-    count = max(min(map(len, sites)) - 1, 0)
-    recorded_by_site = [site[:count, 0, 0] >= 0.0 for site in sites]
-    recorded = np.all(recorded_by_site, axis=0)
-    rows = np.flatnonzero(recorded)
-    span_s = count / BUCKETS_PER_S
-    all_t_s = rows / BUCKETS_PER_S
-
-    acted_s = max(trace.pushed_until_s, _find_last_operator_action(scenario, span_s))
-    changed_s = max(trace.changed_until_s, _find_last_change(scenario, span_s))
-    quiet_from_s = max(acted_s, changed_s)
-    first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
-    _, operator_disturbs = _choose_judged_part(all_t_s, acted_s)
-    operator_acts = is_disturbed and operator_disturbs
-    t_s = all_t_s[first:]
-    judged_rows = rows[first:]
-    columns = [site[judged_rows] for site in sites]
-
-    worst = _find_worst_joint(scenario, t_s, columns, sites)
-    missing = []
-    for name, data in zip(scenario.names, sites, strict=True):
-        if not len(data):
-            missing.append(name)
-    end = worst._replace(
-        missing_sites=tuple(missing),
-        counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
-        quiet_from_s=quiet_from_s,
-        lasts_s=span_s,
-    )
-    first_site = scenario.sites[scenario.names[0]]
-    if first_site.task.space == "position":
-        end = end._replace(error_unit="m")
-
-    if trace.diverged_at_s is not None:
-        return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
-    if end.behaviour.stability is Stability.SETTLED:
-        reasons = list(_find_disagreement(scenario, trace, t_s, columns))
-        reasons += _find_odd_pose(scenario, sites)
-        if is_disturbed and not operator_acts:
-            reasons.append(f"the loop changes until {changed_s:.4g} s, within the judged part")
-        return end._replace(reasons=tuple(reasons))
-    if operator_acts:
-        reason = f"an operator acts until {acted_s:.4g} s, within the judged part"
-        return end._replace(operator_acts=True, reasons=(reason,))
-    return end
 
 
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:

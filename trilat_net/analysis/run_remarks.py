@@ -16,7 +16,7 @@ Invariant:
 import numpy as np
 
 from ..errors import count_nouns, join_words
-from ..log.log_reader import Log
+from ..log import Log
 from .dominance_history import list_program_sites
 from .site_signals import external_torques
 

@@ -16,10 +16,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..core.arms.exogenous import TorqueSource
-from ..core.arms.task_space import POSE, POSITION
-from ..log.log_reader import Log
-from ..log.orientations import compute_continuous_vectors
+from ..core import POSE, POSITION, TorqueSource
+from ..log import Log, compute_continuous_vectors
 from ..scenario import Scenario
 from .aligned import AlignedRecords, align_records
 from .arm_rows import build_arm_rows

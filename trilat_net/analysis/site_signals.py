@@ -18,11 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
-from ..scenario.expect import END_WINDOW_S
+from ..core import Array
+from ..log import Ints, Log, SiteLog
+from ..scenario import END_WINDOW_S
 
 SETTLED_ERROR_RAD = 1e-2
 """Largest error of a settled site, in rad for joints and in m for axes of end effectors."""
@@ -78,45 +76,45 @@ class JointError(NamedTuple):
     joint: str
     t_s: float
 
+    @classmethod
+    def find_largest(cls, part: SiteLog, from_s: float = -math.inf) -> "JointError | None":
+        """Finds the largest error |e| of a site, the first one if it occurs repeatedly.
 
-def find_largest_error(part: SiteLog, from_s: float = -math.inf) -> JointError | None:
-    """Finds the largest error |e| of a site, the first one if it occurs repeatedly.
+        Args:
+            part: Log of the site.
+            from_s: Time after which records count, in s.
 
-    Args:
-        part: Log of the site.
-        from_s: Time after which records count, in s.
+        Returns:
+            The error. None if no record has a finite error.
+        """
+        first = int(np.searchsorted(part.t_s, from_s, side="right"))
+        errors = np.abs(joint_errors(part)[first:])
+        if not np.isfinite(errors).any():
+            return None
+        row, column = np.unravel_index(int(np.nanargmax(errors)), errors.shape)
+        kind = "axis" if part.layout.task else "joint"
+        return JointError(
+            value=float(errors[row, column]),
+            site=part.name,
+            joint=f"{part.name} {kind} {column + 1}",
+            t_s=float(part.t_s[first + row]),
+        )
 
-    Returns:
-        The error. None if no record has a finite error.
-    """
-    first = int(np.searchsorted(part.t_s, from_s, side="right"))
-    errors = np.abs(joint_errors(part)[first:])
-    if not np.isfinite(errors).any():
-        return None
-    row, column = np.unravel_index(int(np.nanargmax(errors)), errors.shape)
-    kind = "axis" if part.layout.task else "joint"
-    return JointError(
-        value=float(errors[row, column]),
-        site=part.name,
-        joint=f"{part.name} {kind} {column + 1}",
-        t_s=float(part.t_s[first + row]),
-    )
+    @classmethod
+    def find_in_last_second(cls, part: SiteLog) -> "JointError | None":
+        """Finds the largest error |e| of a site in the last second of its records.
 
+        The last second, rather than the last record, does not miss an oscillation.
 
-def find_error_of_last_second(part: SiteLog) -> JointError | None:
-    """Finds the largest error |e| of a site in the last second of its records.
+        Args:
+            part: Log of the site.
 
-    The last second, rather than the last record, does not miss an oscillation.
-
-    Args:
-        part: Log of the site.
-
-    Returns:
-        The error. None if no record of that second has a finite error.
-    """
-    if not len(part):
-        return None
-    return find_largest_error(part, from_s=float(part.t_s[-1]) - END_WINDOW_S)
+        Returns:
+            The error. None if no record of that second has a finite error.
+        """
+        if not len(part):
+            return None
+        return JointError.find_largest(part, from_s=float(part.t_s[-1]) - END_WINDOW_S)
 
 
 def find_last_error(log: Log) -> JointError | None:
@@ -130,7 +128,7 @@ def find_last_error(log: Log) -> JointError | None:
     Returns:
         The error. None if no record of that second has a finite error.
     """
-    errors = [find_error_of_last_second(log[site]) for site in log.sites]
+    errors = [JointError.find_in_last_second(log[site]) for site in log.sites]
     known = [error for error in errors if error is not None]
     return max(known, key=lambda error: error.value, default=None)
 

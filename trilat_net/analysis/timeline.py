@@ -17,17 +17,18 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..core.life.session_life import HELD_OVERRUN_TICKS
-from ..core.step.ticks import find_alarm
+from ..core import HELD_OVERRUN_TICKS, LifeAlarm
 from ..errors import count_nouns
-from ..log.log_reader import Log
-from ..log.site_log import SiteLog
-from ..net.messages import MODES, ModeMeaning
-from ..scenario import find_owner
-from ..scenario.delay_models import LinkBase
-from ..scenario.event_text import describe_event
-from ..scenario.run_changes import describe_change, find_requester
-from ..scenario.scenario_types import Change
+from ..log import Log, SiteLog
+from ..net import MODES, ModeMeaning
+from ..scenario import (
+    Change,
+    LinkBase,
+    describe_change,
+    describe_event,
+    find_owner,
+    find_requester,
+)
 
 
 def list_effective_commands(log: Log) -> list[Change]:
@@ -306,7 +307,7 @@ def list_alarms(log: Log) -> list[_RaisedAlarm]:
         part = log[site]
         for mode, from_s, to_s in find_mode_intervals(part):
             state = part.states[int(np.searchsorted(part.t_s, from_s))]
-            alarm = find_alarm(
+            alarm = LifeAlarm.find(
                 session=log.scenario.name,
                 site=site,
                 mode=mode,

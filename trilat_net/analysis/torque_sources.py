@@ -19,17 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arms.exogenous import (
-    LIVE_KINDS,
-    OWN_KINDS,
-    SCRIPTED_KINDS,
-    TorqueKind,
-    TorqueSource,
-)
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..scenario import Scenario, SiteSpec
-from ..scenario.operators import ActorBase
+from ..core import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
+from ..log import Log
+from ..scenario import ActorBase, Scenario, SiteSpec
 from .aligned import AlignedRecords, Bools, align_records
 from .arm_rows import EndEffectorRows, build_arm_rows
 
@@ -306,71 +298,71 @@ class TorqueSplit(NamedTuple):
         """
         return self.environment_now + self.environment_held
 
+    @classmethod
+    def of_records(cls, records: AlignedRecords, scenario: Scenario) -> "TorqueSplit":
+        """Splits the recorded external torque on an arm into operator and environment.
 
-def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Splits the recorded external torque on an arm into operator and environment.
-
-    The environment's torque is computed from the scenario. The rest belongs to the operator.
-    Use `attribute_torque` to find also what the scenario plans for the operator.
-
-    Args:
-        records: Records of the arm's site, the process that runs the arm.
-        scenario: The description of the experiment.
-
-    Returns:
-        The torques at every record. The attribute `script` is None.
-    """
-    spec = scenario.sites[records.site]
-    t_s = records.nominal_s
-    arm = build_arm_rows(scenario, records.site)
-    end_effector = arm.place_end_effector(records.q, records.qd)
-
-    def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
-        """Returns the sum of the torques that the models of operators or environments give.
+        The environment's torque is computed from the scenario. The rest belongs to the
+        operator. Use `attribute_torque` to find also what the scenario plans for the operator.
 
         Args:
-            sources: The operators or environments.
-            sampled: True to add only torques that are computed once per tick and then constant.
-                False to add only torques that follow the motion continuously.
+            records: Records of the arm's site, the process that runs the arm.
+            scenario: The description of the experiment.
 
         Returns:
-            The sum in each of K records for each of n joints, shape (K, n).
+            The torques at every record. The attribute `script` is None.
         """
-        total = np.zeros_like(records.q)
-        for source in sources:
-            actor = source.actor
-            if actor.sampled is not sampled:
-                continue
-            if actor.kind in LIVE_KINDS:
-                torque = compute_live_torque(
-                    source=actor,
-                    hand=records.hand,
-                    q=records.q,
-                    qd=records.qd,
-                    end_effector=end_effector,
-                )
-            else:
-                torque = compute_source_torque(
-                    source=actor,
-                    t_s=t_s,
-                    q=records.q,
-                    qd=records.qd,
-                    end_effector=end_effector,
-                )
-            total = total + torque
-        return total
+        spec = scenario.sites[records.site]
+        t_s = records.nominal_s
+        arm = build_arm_rows(scenario, records.site)
+        end_effector = arm.place_end_effector(records.q, records.qd)
 
-    environment_now = add_torques(spec.environment, sampled=False)
-    environment_held = add_torques(spec.environment, sampled=True)
-    operator_held = add_torques(spec.hands, sampled=True)
-    operator_now = -records.tau_x - environment_now - environment_held - operator_held
-    return TorqueSplit(
-        end_effector=end_effector,
-        operator_now=operator_now,
-        operator_held=operator_held,
-        environment_now=environment_now,
-        environment_held=environment_held,
-    )
+        def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
+            """Returns the sum of the torques that the models of operators or environments give.
+
+            Args:
+                sources: The operators or environments.
+                sampled: True to add only torques that are computed once per tick and then
+                    constant. False to add only torques that follow the motion continuously.
+
+            Returns:
+                The sum in each of K records for each of n joints, shape (K, n).
+            """
+            total = np.zeros_like(records.q)
+            for source in sources:
+                actor = source.actor
+                if actor.sampled is not sampled:
+                    continue
+                if actor.kind in LIVE_KINDS:
+                    torque = compute_live_torque(
+                        source=actor,
+                        hand=records.hand,
+                        q=records.q,
+                        qd=records.qd,
+                        end_effector=end_effector,
+                    )
+                else:
+                    torque = compute_source_torque(
+                        source=actor,
+                        t_s=t_s,
+                        q=records.q,
+                        qd=records.qd,
+                        end_effector=end_effector,
+                    )
+                total = total + torque
+            return total
+
+        environment_now = add_torques(spec.environment, sampled=False)
+        environment_held = add_torques(spec.environment, sampled=True)
+        operator_held = add_torques(spec.hands, sampled=True)
+        operator_now = -records.tau_x - environment_now - environment_held - operator_held
+        return TorqueSplit(
+            end_effector=end_effector,
+            operator_now=operator_now,
+            operator_held=operator_held,
+            environment_now=environment_now,
+            environment_held=environment_held,
+        )
 
 
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
@@ -463,7 +455,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     Returns:
         The torques at every record.
     """
-    split = split_torque(records, scenario)
+    split = TorqueSplit.of_records(records, scenario)
     t_s = records.nominal_s
     spec = scenario.sites[records.site]
     expected = np.zeros_like(records.q)

@@ -1,1 +1,63 @@
 """What people start: the command line, the Python interface, demo, doctor and player."""
+
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # The command line
+    "flag",
+    "options",
+    "run_and_report",
+    "run_in_own_folder",
+    "seconds",
+    "show_progress",
+    "value",
+    # The Python interface
+    "AnyScenario",
+    "Overrides",
+    # Sessions
+    "HEADS",
+    "RunningSession",
+    "SessionDisplay",
+    "SessionResult",
+    "ShareHistory",
+    "SiteRow",
+    "compile_core",
+    "describe_angles",
+    "describe_site",
+    "open_hand",
+    "ping_session",
+    "run_demo",
+    # Input devices
+    "Device",
+    "DeviceState",
+    "Vector",
+]
+
+if TYPE_CHECKING:
+    from .api import AnyScenario, Overrides
+    from .cli import options
+    from .cli.options import flag, seconds, value
+    from .cli.run_progress import run_in_own_folder, show_progress
+    from .cli.sessions import run_and_report
+    from .demo_session import SessionResult, compile_core, run_demo
+    from .input_device import Device, DeviceState, Vector
+    from .monitor import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
+    from .running_session import RunningSession, ShareHistory, open_hand
+    from .session_ping import ping_session
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "api": "AnyScenario Overrides",
+            "cli.options": "flag options seconds value",
+            "cli.run_progress": "run_in_own_folder show_progress",
+            "cli.sessions": "run_and_report",
+            "demo_session": "SessionResult compile_core run_demo",
+            "input_device": "Device DeviceState Vector",
+            "monitor": "HEADS SessionDisplay SiteRow describe_angles describe_site",
+            "running_session": "RunningSession ShareHistory open_hand",
+            "session_ping": "ping_session",
+        },
+    )

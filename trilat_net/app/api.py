@@ -12,20 +12,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from ..analysis import Certificate, LogMetrics, compute_log_metrics
 from ..entry_points import find_viewer
 from ..errors import UsageError
-from ..execution.log_checks import LogCheckReport, run_log_checks
-from ..execution.virtual import SimulatedLog, simulate_scenario
-from ..files import choose_report_folder, make_results_folder
-from ..log.accounting import MIN_COVERAGE
-from ..log.log_reader import Log, open_log, open_logs
+from ..execution import LogCheckReport, SimulatedLog, simulate_scenario
+from ..files import make_results_folder
+from ..log import MIN_COVERAGE, Log, open_log, open_logs
 from ..scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
-    from ..analysis.theory.linear_analysis import LinearAnalysis
-    from ..presentation.conclude import Conclusion
+    from ..analysis import LinearAnalysis
+    from ..presentation import Conclusion
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario
 AnyLog = str | Path | Log
@@ -99,7 +96,7 @@ def export(
         UsageError: There is no such format or setting, a package is missing, or the path
             exists.
     """
-    from ..presentation.export import Exporter
+    from ..presentation import Exporter
 
     exporter = Exporter(to, Path(out), force=force, settings=settings)
     all_logs = [log] if isinstance(log, str | Path | Log) else log
@@ -140,7 +137,7 @@ def verify(
     Raises:
         LogError: The log cannot be read.
     """
-    return run_log_checks(
+    return LogCheckReport.of_log(
         _open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every
     )
 
@@ -174,7 +171,7 @@ def certify(
     Raises:
         LogError: The log cannot be read, or no site has a record in it.
     """
-    from ..analysis.judge import certify_run
+    from ..analysis import certify_run
 
     opened = _open(log)
     opened.require_records()
@@ -204,6 +201,15 @@ def metrics(log: AnyLog) -> LogMetrics:
     return compute_log_metrics(opened)
 
 
+def choose_report_folder(log: Path) -> Path:
+    """Returns the default folder of a log's report, which is named after the log.
+
+    Args:
+        log: File of the log. If its name has no suffix, the folder ends in "-report".
+    """
+    return log.with_suffix("") if log.suffix else log.with_name(f"{log.name}-report")
+
+
 def report(
     log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
 ) -> "Conclusion":
@@ -227,7 +233,7 @@ def report(
         UsageError: The folder is not empty, or the log is not in a file.
         LogError: The log cannot be read, or no site has a record in it.
     """
-    from ..presentation.conclude import conclude
+    from ..presentation import conclude
 
     opened = _open(log)
     opened.require_records()
@@ -278,8 +284,7 @@ def linear(
         ScenarioError: The scenario is not valid, or has no linear loop.
         UsageError: Another argument is not valid.
     """
-    from ..analysis.theory.hand_files import read_hands
-    from ..analysis.theory.linear_analysis import analyse_linear_loop
+    from ..analysis import analyse_linear_loop, read_hands
 
     try:
         angles = None if pose is None else tuple(map(float, pose))
@@ -330,8 +335,12 @@ def view(
             such viewer.
         LogError: The log cannot be read.
     """
-    from ..presentation.rerun_viewer import ViewerOptions, open_rerun
-    from ..presentation.viewer_files import write_foxglove_layout, write_rviz_config
+    from ..presentation import (
+        ViewerOptions,
+        open_rerun,
+        write_foxglove_layout,
+        write_rviz_config,
+    )
 
     paths = [Path(file) for file in files]
     if viewer is not None:

@@ -29,36 +29,27 @@ from functools import partial
 from itertools import chain
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rich.console import Console
 from setproctitle import setproctitle
 
-from sites.machine_load import check_machine_load
-from sites.site_parts import warm_up
-from trilat_net.core.step.jit import compiling_notice, is_core_cached
-from trilat_net.core.step.ticks import NS_PER_S
+from sites import check_machine_load, warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import (
-    create_file,
-    find_page,
-    make_results_folder,
-    make_subfolder,
-    write_whole,
-)
-from trilat_net.log.log_reader import Log, open_log
+from trilat_net.files import find_page, make_results_folder, make_subfolder, write_whole
 from trilat_net.net import topics
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import reserve_session_endpoints
-from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.own_code.code_consent import list_imported_code
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.program_hand import find_own_hand
-from trilat_net.scenario.validate import check_outside_arms
 from trilat_net.signals import Interrupt
 
+from ..core import compiling_notice, is_core_cached
+from ..files import refuse_link
+from ..log import Log, open_log
+from ..net import Clock, SystemClock, ZenohBus, reserve_session_endpoints
+from ..own_code import list_imported_code
+from ..records import NS_PER_S
+from ..scenario import HandSite, check_outside_arms
 from .monitor import SessionDisplay, SessionMonitor
 
 POLL_NS = 100_000_000
@@ -154,6 +145,21 @@ class SessionProcess:
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last_line = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
         return f"{self.name} ended with code {code}: {last_line}"
+
+
+def create_file(path: Path) -> BinaryIO:
+    """Creates a file for writing without a buffer. An earlier file of that name is deleted.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        UsageError: The path is a symbolic link.
+        OSError: The file cannot be made.
+    """
+    refuse_link(path)
+    path.unlink(missing_ok=True)
+    return path.open("xb", buffering=0)
 
 
 class ProcessStarter:
@@ -456,7 +462,7 @@ def _needs_hand_process(scenario: Scenario, site: str) -> bool:
         scenario: The scenario.
         site: Name of the site.
     """
-    own_hand = find_own_hand(scenario, site)
+    own_hand = HandSite.find(scenario, site)
     return own_hand is not None and own_hand.has_separate_process
 
 

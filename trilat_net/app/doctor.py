@@ -26,34 +26,30 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from sites.loop_rehearsal import rehearse_loop
-from sites.machine_load import check_machine_load
-from sites.site_parts import warm_up
+from sites import check_machine_load, rehearse_loop, warm_up
 from trilat_net import workers
-from trilat_net.core.step.jit import is_core_cached
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
 from trilat_net.files import read_foreign_permissions
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import (
-    ENCRYPTED,
-    ENDS_SOON,
-    Connection,
-    find_endpoint_addresses,
-    is_loopback,
-    resolve_member_connection,
-    secure_connection,
-)
-from trilat_net.net.member_keys import (
-    AUTHORITY,
-    CERTIFICATE,
-    PRIVATE_KEY,
-    MemberKeys,
-    read_member_keys,
-)
-from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import load_scenario
 
+from ..core import is_core_cached
+from ..net import (
+    AUTHORITY,
+    CERTIFICATE,
+    ENCRYPTED,
+    ENDS_SOON,
+    PRIVATE_KEY,
+    Clock,
+    Connection,
+    MemberKeys,
+    RouterSilent,
+    SystemClock,
+    ZenohBus,
+    find_endpoint_addresses,
+    is_loopback,
+    read_member_keys,
+)
 from .session_ping import ping_session
 
 FindingState = Literal["ok", "warn", "fail"]
@@ -123,7 +119,7 @@ def examine_machine(
     yield from examine_links(connection, keys, member_keys, insecure=insecure)
     yield from examine_clock(clock)
     if session is not None:
-        safe = secure_connection(connection, member_keys, insecure=insecure)
+        safe = connection.secure(member_keys, insecure=insecure)
         yield from _examine_offsets(safe, clock, session)
     yield examine_system()
     yield from examine_rights()
@@ -194,7 +190,7 @@ def examine_links(
         all.
     """
     try:
-        safe = secure_connection(connection, member_keys, insecure=insecure)
+        safe = connection.secure(member_keys, insecure=insecure)
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
@@ -647,7 +643,7 @@ class DoctorReport(Result):
         The module for texts is imported only here, because programs that read values need no
         text.
         """
-        from ..presentation.summary_text import compose_doctor
+        from ..presentation import compose_doctor
 
         return compose_doctor(self)
 
@@ -684,7 +680,7 @@ def doctor(
         UsageError: An endpoint or the keys cannot be used.
     """
     findings = examine_machine(
-        connection=resolve_member_connection(listen, connect, router),
+        connection=Connection.of_member(listen, connect, router),
         keys=None if keys is None else Path(keys),
         folder=Path(folder),
         session=session,

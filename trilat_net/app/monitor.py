@@ -18,15 +18,13 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from trilat_net.core.life.live_hand import HandInForce
-from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
-from trilat_net.log.site_log import compute_task_errors
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.membership import read_messages, read_records
-from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.scenario import Scenario
+
+from ..core import HandInForce, LifeAlarm
+from ..log import compute_task_errors
+from ..net import Bus, Clock, Event, LinkStats, State, read_messages, read_records
+from ..records import NS_PER_S
 
 AGES = "age of each peer's sample"
 """Heading of the column with the ages of the peers' samples."""

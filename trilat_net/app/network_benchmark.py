@@ -28,25 +28,31 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.core.step.vectors import Array
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
 from trilat_net.files import require_libraries
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, StampedInbox
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import (
-    ENCRYPTED,
-    Connection,
-    find_free_endpoints,
-    secure_connection,
-)
-from trilat_net.net.member_keys import MemberKeys, create_keys, read_member_keys
-from trilat_net.net.messages import VERSION, PeerSample
-from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.net.zenoh_config import ROLES, ROUTER
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
+
+from ..core import Array
+from ..net import (
+    ENCRYPTED,
+    ROLES,
+    ROUTER,
+    VERSION,
+    Bus,
+    Clock,
+    Connection,
+    MemberKeys,
+    PeerSample,
+    StampedInbox,
+    SystemClock,
+    ZenohBus,
+    create_keys,
+    find_free_endpoints,
+    read_member_keys,
+)
+from ..scenario import ConstantDelay
 
 SESSION = "benchmark"
 """Name of the session under whose keys the messages of the benchmark travel."""
@@ -248,7 +254,7 @@ def _open(
         connection = Connection(connect=[endpoint])
         name = NEAR
 
-    bus = secure_connection(connection, used_keys, insecure=insecure).open()
+    bus = connection.secure(used_keys, insecure=insecure).open()
     return bus, used_keys.member if used_keys else name
 
 
@@ -370,7 +376,7 @@ def find_needs(scenario: Scenario) -> _ScenarioNeeds:
     try:
         require_libraries("scipy")
         # Imported here because the far end does not need SciPy.
-        from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
+        from ..analysis import analyse_linear_loop
 
         loop = analyse_linear_loop(load_scenario(scenario, overrides))
     except (ScenarioError, RunFailed, UsageError) as error:
@@ -531,7 +537,7 @@ class NetworkBenchmark(Result):
         The module for texts is imported only here, because programs that read values need no
         text.
         """
-        from ..presentation.summary_text import compose_benchmark
+        from ..presentation import compose_benchmark
 
         return compose_benchmark(self)
 

@@ -1,6 +1,6 @@
 """Reads the scenario of a session for the recorder, which knows nothing of scenarios."""
 
-from recorder.record_process import ReadScenario, RecordedScenario
+from recorder import ReadScenario, RecordedScenario
 
 from ..hooks import find_hook
 from ..scenario import parse_embedded

@@ -26,25 +26,30 @@ from typing import Any
 from trilat_net.entry_points import HOOKS, load_entry
 from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
 from trilat_net.net import topics
-from trilat_net.net.arm_client import Hand
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection
-from trilat_net.net.discovery import (
+from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
+
+from ..net import (
+    OPERATOR,
     REPLY_TIMEOUT_S,
+    Bus,
+    ChangeReply,
+    ChangeRequest,
+    Clock,
+    Connection,
+    Event,
+    Hand,
+    Info,
+    OrderName,
+    State,
+    SystemClock,
     connect_to_session,
     find_members,
     list_past_events,
+    read_messages,
+    read_records,
     send_change,
 )
-from trilat_net.net.membership import read_messages, read_records
-from trilat_net.net.messages import Event, Info, State
-from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
-from trilat_net.net.zenoh_config import OPERATOR
-from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
-from trilat_net.scenario.run_changes import parse_core_change
-from trilat_net.scenario.sample_uses import PictureDelay
-
+from ..scenario import PictureDelay, parse_core_change
 from .input_device import Device
 from .session_ping import PingReport, ping_session
 
@@ -784,8 +789,8 @@ def session(
     Raises:
         UsageError: An endpoint or the keys cannot be used.
     """
-    connection = resolve_member_connection(None, connect, router)
-    return RunningSession(name, secure_connection(connection, keys, insecure=False))
+    connection = Connection.of_member(None, connect, router)
+    return RunningSession(name, connection.secure(keys, insecure=False))
 
 
 def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
@@ -844,9 +849,7 @@ def hand(
         UsageError: The scenario permits no live operator at that arm, or an endpoint cannot be
             used.
     """
-    connection = secure_connection(
-        resolve_member_connection(None, connect, router), keys, insecure=False
-    )
+    connection = Connection.of_member(None, connect, router).secure(keys, insecure=False)
     with (
         RunningSession(session, connection).reach_site(site, timeout_s) as (bus, scenario),
         open_hand(

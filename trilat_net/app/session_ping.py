@@ -19,20 +19,28 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import RunFailed, ScenarioError, SessionError
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection, default_endpoint
-from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import MemberQuery, read_messages
-from trilat_net.net.messages import Info, LinkStats
-from trilat_net.net.offset import exact_offset
-from trilat_net.net.pinging import PING_PACE_NS, Pinger
-from trilat_net.net.ros2_graph import Attachment, Ros2Graph
 from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
+
+from ..net import (
+    PING_PACE_NS,
+    Attachment,
+    Bus,
+    Clock,
+    Connection,
+    Info,
+    LinkStats,
+    MemberQuery,
+    Pinger,
+    Ros2Graph,
+    connect_to_session,
+    default_endpoint,
+    exact_offset,
+    read_messages,
+)
+from ..records import NS_PER_S
 
 POLL_NS = 1_000_000
 """Longest pause between two polls, in ns."""
@@ -73,7 +81,7 @@ class PingReport(Result):
         The module for texts is imported only here, because programs that read values need no
         text.
         """
-        from ..presentation.summary_text import compose_ping
+        from ..presentation import compose_ping
 
         return compose_ping(self)
 
@@ -320,7 +328,7 @@ class TopicDelays(Result):
         The module for texts is imported only here, because programs that read values need no
         text.
         """
-        from ..presentation.summary_text import compose_topic_delays
+        from ..presentation import compose_topic_delays
 
         return compose_topic_delays(self)
 

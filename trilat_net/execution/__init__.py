@@ -1,1 +1,77 @@
 """Executes sites in virtual time: anew, from a log, or from a log with changed settings."""
+
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # Runs in virtual time
+    "FusedRun",
+    "RunTotals",
+    "SimulatedLog",
+    "check_fusable",
+    "check_virtual",
+    "execute_virtual",
+    "explain_not_repeatable",
+    "find_absent_samples",
+    "record_virtual",
+    "simulate_scenario",
+    "simulate_without_operators",
+    # Runs side by side
+    "RunGroup",
+    "describe_structure",
+    "group_runs",
+    # Execution of a log
+    "LinkEffect",
+    "LogCheckReport",
+    "Rerun",
+    "SiteEffect",
+    "check_log_files",
+    "describe_rerun_changes",
+    "rerun",
+    "verify",
+    # Twins
+    "LEAST_PUSH",
+    "MOST_PUSH",
+    "PUSH_RAD",
+    "SMALLEST",
+    "Push",
+    "TwinPath",
+    "Twins",
+]
+
+if TYPE_CHECKING:
+    from .fused import FusedRun, RunTotals, check_fusable, explain_not_repeatable
+    from .lanes.lane_structure import describe_structure
+    from .lanes.run_groups import RunGroup, group_runs
+    from .log_checks import LogCheckReport, check_log_files
+    from .rerun_execution import describe_rerun_changes
+    from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
+    from .verification import verify
+    from .virtual import (
+        SimulatedLog,
+        check_virtual,
+        execute_virtual,
+        record_virtual,
+        simulate_scenario,
+    )
+    from .virtual_comparison import find_absent_samples, simulate_without_operators
+    from .what_if import LinkEffect, Rerun, SiteEffect, rerun
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "fused": "FusedRun RunTotals check_fusable explain_not_repeatable",
+            "lanes.lane_structure": "describe_structure",
+            "lanes.run_groups": "RunGroup group_runs",
+            "log_checks": "LogCheckReport check_log_files",
+            "rerun_execution": "describe_rerun_changes",
+            "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
+            "verification": "verify",
+            "virtual": (
+                "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
+            ),
+            "virtual_comparison": "find_absent_samples simulate_without_operators",
+            "what_if": "LinkEffect Rerun SiteEffect rerun",
+        },
+    )

@@ -26,34 +26,39 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.exogenous import LIVE_KINDS
-from ..core.links.delay import max_delay_us
-from ..core.plug.compiled_law import CompiledLaw, plug_law
-from ..core.plug.law_view import PlainLaw
-from ..core.step.fused_run import (
+from ..core import (
+    BUCKETS_PER_S,
+    LIVE_KINDS,
+    MAX_ARRIVALS,
     NEVER_NS,
     PROGRESS_DTYPE,
+    Array,
+    CompiledLaw,
+    CoreChange,
+    IntArray,
     LawArrays,
+    PlainLaw,
     RecentRecords,
     ReplayedInputs,
+    Row,
+    RowArray,
+    SiteArrays,
+    SiteSetup,
+    apply_change,
     finish_site,
+    max_delay_us,
     max_over_joints,
+    plug_law,
     run_until,
     sense_site,
     sums_dtype,
+    tick_ns,
 )
-from ..core.step.site_arrays import SiteArrays, apply_change, select_site, stack_site_arrays
-from ..core.step.site_setup import SiteSetup
-from ..core.step.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
-from ..core.step.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError, count_nouns
-from ..log.log_reader import Log
-from ..own_code.code_consent import find_user_laws
-from ..scenario import Scenario
-from ..scenario.operators.kernel_operators import Wall
-from ..scenario.operators.program_hand import make_hand_players
-from ..scenario.plant_player import PlantPlayer
-from ..scenario.validate import refuse_external_arms
+from ..log import Log
+from ..own_code import find_user_laws
+from ..records import NS_PER_S, Mode
+from ..scenario import PlantPlayer, Scenario, Wall, make_hand_players, refuse_external_arms
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
@@ -83,7 +88,7 @@ def scale_differences(x: Array, y: Array, factor: float) -> Array:
     return np.where(np.isfinite(mixed), mixed, y)
 
 
-class RunState:
+class _RunState:
     """All arrays that change during a run, viewed as 64-bit integers.
 
     A run creates one object, with which its state can be copied to another run, or mixed with
@@ -106,7 +111,7 @@ class RunState:
             self._bits.append(flat)
             self._floats.append(np.tile(mark_floats(array.dtype), array.size))
 
-    def scale_difference(self, other: "RunState", factor: float) -> None:
+    def scale_difference(self, other: "_RunState", factor: float) -> None:
         """Multiplies the difference between this state and another one by a factor.
 
         Every floating-point number x of this state becomes x_other + factor (x - x_other). With
@@ -164,7 +169,7 @@ def _find_largest_ratio(scenario: Scenario) -> int:
     return math.ceil(max(rates_hz) / min(rates_hz))
 
 
-class HandActor(Protocol):
+class _HandActor(Protocol):
     """Interface of a live operator in a compiled run.
 
     A live operator is a person or program that moves an arm while the run is in progress. The
@@ -319,7 +324,7 @@ class FusedRun:
         settled_rad: float = 0.01,
         keep: int = 0,
         inputs: RunInputs | None = None,
-        hands: Mapping[str, HandActor] = {},
+        hands: Mapping[str, _HandActor] = {},
         plants: Mapping[str, PlantPlayer] = {},
     ) -> None:
         check_fusable(scenario, plants)
@@ -331,11 +336,11 @@ class FusedRun:
         self.scenario = scenario
         self._settled_rad = settled_rad
         self._inputs = inputs or _make_prompt_inputs(count)
-        self._hands: dict[int, HandActor] = {}
+        self._hands: dict[int, _HandActor] = {}
         if inputs is None:
             self._connect_hands({**make_hand_players(scenario), **hands}, setups)
         self._changes = deque(self._inputs.changes)
-        self._tables = stack_site_arrays(
+        self._tables = SiteArrays.stack(
             setups, len(self._changes), self._inputs.longest_us, self._inputs.late_ns
         )
         self._layouts = [setup.layout for setup in setups]
@@ -390,7 +395,7 @@ class FusedRun:
         )
 
     def _connect_hands(
-        self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]
+        self, hands: Mapping[str, _HandActor], setups: Sequence[SiteSetup]
     ) -> None:
         """Connects live operators to their sites, and allocates memory for their actions.
 
@@ -441,7 +446,7 @@ class FusedRun:
         sent = np.zeros((site_count, most_sent_numbers))
         for i, setup in enumerate(setups):
             if setup.law_factory is not None:
-                arrays = select_site(self._tables, i, setup.layout)
+                arrays = self._tables.select(i, setup.layout)
                 law = setup.law_factory(setup.law_context())
                 sent_by_law = sent[i, : setup.channel.record_size]
                 self._laws[i] = plug_law(law, setup, arrays, sent_by_law)
@@ -727,7 +732,7 @@ class FusedRun:
             self._inputs = self._inputs._replace(feed=feed._replace(hands=actions))
 
     @cached_property
-    def _state(self) -> RunState:
+    def _state(self) -> _RunState:
         """All arrays of the run that change while it is executed."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
@@ -736,7 +741,7 @@ class FusedRun:
             arrays += tables.channel
         if self._law_arrays is not None:
             arrays += [self._law_arrays.rows, self._law_arrays.sent]
-        return RunState(arrays)
+        return _RunState(arrays)
 
     @property
     def has_programs(self) -> bool:
@@ -759,7 +764,7 @@ class FusedRun:
         """Multiplies the difference between the states of this run and another run by a factor.
 
         Every floating-point number x of the state becomes x_other + factor (x - x_other), see
-        `RunState.scale_difference`. This is not possible if operators or arms are users'
+        `_RunState.scale_difference`. This is not possible if operators or arms are users'
         programs, because the state of such programs is not known.
 
         Args:
@@ -793,7 +798,7 @@ class FusedRun:
         """
         self._update_links()
         if i not in self._selected:
-            self._selected[i] = select_site(self._tables, i, self._layouts[i])
+            self._selected[i] = self._tables.select(i, self._layouts[i])
         return self._selected[i]
 
     def displace(self, field: str, offsets: Array) -> None:

@@ -18,13 +18,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..errors import ScenarioError, count_nouns, join_arguments
-from ..log.accounting import MIN_COVERAGE, describe_unknown_ends
-from ..log.findings import CheckReport, Finding
-from ..log.log_reader import Log, open_log
-from ..log.mcap_reader import Progress
-from ..own_code.code_consent import find_user_laws
-from ..own_code.imported_code import CodeConsents, allowed_code
-from .verify import VerifyResult, verify
+from ..log import (
+    MIN_COVERAGE,
+    CheckReport,
+    Finding,
+    Log,
+    Progress,
+    describe_unknown_ends,
+    open_log,
+)
+from ..own_code import CodeConsents, allowed_code, find_user_laws
+from .verification import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 _MAX_GAPS_NAMED = 60
@@ -94,46 +98,47 @@ class LogCheckReport(CheckReport):
             "checks": self.to_rows(),
         }
 
+    @classmethod
+    def of_log(
+        cls,
+        log: Log,
+        *,
+        virtual: bool,
+        progress: Progress | None = None,
+        min_coverage: float = MIN_COVERAGE,
+        resume_every: int = 0,
+    ) -> "LogCheckReport":
+        """Executes the sites of a log again, and checks the log against the results.
+
+        Args:
+            log: Log of a run or of a rerun that is to be checked.
+            virtual: If True, the log is also compared with a simulation of its scenario in
+                virtual time, as `compare_with_virtual` does.
+            progress: Function that is called now and then with the amount of work done and the
+                total. None if nobody wants to know.
+            min_coverage: Smallest fraction of the ticks of every site that must be compared. A
+                log with a smaller fraction fails even if all compared records agree.
+            resume_every: Every how many ticks a site is restored from the records, see
+                `verify`. 0 means never.
+
+        Returns:
+            The findings of all checks.
+
+        Raises:
+            LogError: A record cannot be read.
+            ScenarioError: A user's control law that may run cannot be created.
+        """
+        result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
+        findings = list(_check_log(log, result, virtual=virtual, progress=progress))
+        if not resume_every:
+            findings = [_add_memory_advice(finding, log, result) for finding in findings]
+        return LogCheckReport(log, result, findings)
+
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
     """Returns a range of ticks as plain values."""
     site, first, last = gap
     return {"site": site, "first": first, "last": last}
-
-
-def run_log_checks(
-    log: Log,
-    *,
-    virtual: bool,
-    progress: Progress | None = None,
-    min_coverage: float = MIN_COVERAGE,
-    resume_every: int = 0,
-) -> LogCheckReport:
-    """Executes the sites of a log again, and checks the log against the results.
-
-    Args:
-        log: Log of a run or of a rerun that is to be checked.
-        virtual: If True, the log is also compared with a simulation of its scenario in virtual
-            time, as `compare_with_virtual` does.
-        progress: Function that is called now and then with the amount of work done and the
-            total. None if nobody wants to know.
-        min_coverage: Smallest fraction of the ticks of every site that must be compared. A log
-            with a smaller fraction fails even if all compared records agree.
-        resume_every: Every how many ticks a site is restored from the records, see `verify`. 0
-            means never.
-
-    Returns:
-        The findings of all checks.
-
-    Raises:
-        LogError: A record cannot be read.
-        ScenarioError: A user's control law that may run cannot be created.
-    """
-    result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
-    findings = list(_check_log(log, result, virtual=virtual, progress=progress))
-    if not resume_every:
-        findings = [_add_memory_advice(finding, log, result) for finding in findings]
-    return LogCheckReport(log, result, findings)
 
 
 def check_log_files(
@@ -155,7 +160,7 @@ def check_log_files(
     allowed_code.update(allowed)
     log = open_log(*sources)
     try:
-        return run_log_checks(log, virtual=True, min_coverage=min_coverage).findings
+        return LogCheckReport.of_log(log, virtual=True, min_coverage=min_coverage).findings
     except ScenarioError as error:
         return [Finding("executed again", f"cannot be: {error}", False)]
 

@@ -15,14 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.step.jit import leaf
-from ..core.step.recorded_ticks import RecordedRows, TickRepeater
-from ..core.step.site_step import Site
-from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S
-from ..core.step.vectors import Array, IntArray
-from ..log.log_reader import Log
-from ..log.packed.indexed_records import IndexedRecords
-from ..log.site_log import SiteLog
+from ..core import MAX_ARRIVALS, Array, IntArray, RecordedRows, Site, TickRepeater, leaf
+from ..log import IndexedRecords, Log, SiteLog
+from ..records import NS_PER_S
 
 BLOCK_ROWS = 1 << 14
 """Largest number of records that are executed again together."""

@@ -25,16 +25,21 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ..core.step.site_step import Site
-from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickInput, TickRecord
+from ..core import MAX_ARRIVALS, Site, TickInput
 from ..errors import LogError, ScenarioError, UsageError
-from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from ..net.messages import LinkStats
-from ..net.timing import LoopStats
-from ..net.wire import encode_state
-from ..scenario import Scenario, find_owner, find_site, load_scenario, parse_scenario
-from ..scenario.describe import describe_law, describe_value, flatten_table
+from ..log import Log, Progress
+from ..net import LinkStats, LoopStats, encode_state
+from ..records import NS_PER_S, Arrival, Mode, TickRecord
+from ..scenario import (
+    Scenario,
+    describe_law,
+    describe_value,
+    find_owner,
+    find_site,
+    flatten_table,
+    load_scenario,
+    parse_scenario,
+)
 from .resumption import (
     ReceivedMotion,
     RecordedInputs,
@@ -42,7 +47,7 @@ from .resumption import (
     make_arrival,
     read_output,
 )
-from .verify import (
+from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
     equal_bits,

@@ -20,12 +20,10 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..core.links.delay import MAX_DELAY_US
-from ..core.step.site_setup import LinkSetup
-from ..core.step.site_step import Site
-from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, TickRecord
-from ..log.site_log import SiteLog
-from ..net.messages import MODES, RESTING_MODES, State
+from ..core import MAX_ARRIVALS, MAX_DELAY_US, CoreChange, LinkSetup, Site
+from ..log import SiteLog
+from ..net import MODES, RESTING_MODES, State
+from ..records import NS_PER_S, Arrival, TickRecord
 
 _LOOK_BACK = 100
 """Number of records before a gap in which the newest arrived sample is searched."""

@@ -25,12 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.step.site_setup import Law
-from ..core.step.ticks import BUCKETS_PER_S, NS_PER_S
-from ..core.step.vectors import Array
+from ..core import BUCKETS_PER_S, Array, Law
 from ..errors import NotRepeatable, UsageError, count_nouns
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
+from ..log import Ints, Log
+from ..records import NS_PER_S
 from ..scenario import Scenario
 from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 
@@ -77,6 +75,106 @@ class Push(NamedTuple):
     largest: float = LARGEST
     direction: int = 0
 
+    @classmethod
+    def parse(
+        cls, scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
+    ) -> "Push":
+        """Converts a user's description of a push to the push.
+
+        A push is a small displacement of the state of a twin, which is a second execution of
+        the run. Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of
+        joint 2), "m2.theta3" (estimate 3) and "m1.q". Without a number, all joints or estimates
+        of the site are pushed in a random direction. Without a site, those of all sites are.
+
+        The twin is pushed only once. A push that is itself larger than `LARGEST` is never
+        scaled down.
+
+        Args:
+            scenario: Description of the experiment.
+            target: Description of what is pushed, for example "m1.q1".
+            size: Size of the push, in rad, rad/s, or the unit of an estimate.
+            at_s: Time of the push, in s after the epoch (the common start time).
+
+        Raises:
+            UsageError: The scenario has no such target, or the size is out of range.
+        """
+        match = _TARGET.fullmatch(target)
+        if match is None:
+            raise UsageError(_describe_targets(scenario, target))
+
+        site, kind, number = match.groups()
+        counts = _count_estimates(scenario) if kind == "theta" else _count_joints(scenario)
+        owners = []  # indices of the sites that are pushed
+        for i, name in enumerate(scenario.names):
+            if site in (None, name) and counts[i] >= int(number or 1):
+                owners.append(i)
+        if not owners or (number and not site):
+            raise UsageError(_describe_targets(scenario, target))
+        if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
+            raise UsageError(
+                f"--push {target}={size:g}: the size of a push must be from {LEAST_PUSH:g} "
+                f"to {MOST_PUSH:g}"
+            )
+
+        generator = np.random.Generator(np.random.Philox(0))
+        displacements = np.zeros((len(counts), max(counts)))
+        for i in owners:
+            if number:
+                direction = np.arange(counts[i]) == int(number) - 1
+            else:
+                direction = generator.uniform(-1.0, 1.0, counts[i])
+            displacements[i, : counts[i]] = size * direction
+
+        return cls(
+            name=f"{size:g} {_describe_target(site, kind, number)}",
+            field="theta_hat" if kind == "theta" else kind,
+            by=displacements,
+            at_s=at_s,
+            again=False,
+            largest=LARGEST if abs(size) < LARGEST else math.inf,
+        )
+
+    @classmethod
+    def choose(cls, scenario: Scenario, count: int | None = None) -> "list[Push]":
+        """Chooses pushes that together can reveal every kind of instability.
+
+        A push is a small displacement of the state of a twin, which is a second execution of
+        the run. Different pushes displace different joints or estimates:
+
+        - one push of all estimated parameters if the control law of a site estimates any;
+        - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`.
+          The sizes differ, because growth may depend on the amplitude;
+        - one push of each joint, because a joint that does not act on the others shows its
+          growth clearly only if it is pushed itself.
+
+        If there are not enough pushes for all joints, the joints are not pushed one by one, but
+        all together in several random directions.
+
+        Args:
+            scenario: Description of the experiment.
+            count: Number of pushes. None for one push of each joint and the others above, up to
+                `MAX_PUSHES`.
+        """
+        # The target of "m1 joint 1" is "m1.q1".
+        joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
+        learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
+        complete_count = len(joint_targets) + 2
+        if count is None:
+            count = min(complete_count, MAX_PUSHES)
+
+        pushes = []
+        if learns and count > 2:
+            pushes.append(cls.parse(scenario, "theta"))
+        if count < complete_count:
+            numbers = range(1, count - len(pushes) + 1)
+            pushes += [_push_in_random_direction(scenario, number) for number in numbers]
+        else:
+            random_count = min(3, count - len(joint_targets) - len(pushes))
+            factors = (1.0, 1e-3, 1e3)[:random_count]
+            pushes += [cls.parse(scenario, "q", factor * PUSH_RAD) for factor in factors]
+            pushes += [cls.parse(scenario, target) for target in joint_targets]
+        return [push._replace(again=True, largest=LARGEST) for push in pushes]
+
 
 class TwinPath(NamedTuple):
     """Course of the difference between a twin and the run, in intervals of 50 ms.
@@ -113,8 +211,8 @@ class Twins(NamedTuple):
     """A run, compared with its twins.
 
     A twin is a second execution of the run in which the state received a small push. The twins
-    show whether small disturbances grow or die away. `run_twins` and `run_virtual_twins` create
-    the object.
+    show whether small disturbances grow or die away. `of_log` and `of_scenario` create the
+    object.
 
     Attributes:
         paths: Course of the difference of each twin from the run.
@@ -128,6 +226,59 @@ class Twins(NamedTuple):
     joints: tuple[str, ...]
     speed: Array
     same: bool
+
+    @classmethod
+    def of_log(cls, log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> "Twins":
+        """Repeats the run of a log, together with a twin for every push.
+
+        A twin is a further execution of the run that receives a small push. The differences
+        between the twins and the run show whether small disturbances grow or die away.
+
+        Args:
+            log: Log of the run.
+            pushes: Small displacements of the state, one for each twin.
+            own_laws: True if control laws that are code of users may run.
+
+        Raises:
+            NotRepeatable: The run cannot be repeated, or the repeated run differs from the
+                records.
+            LogError: A record cannot be read.
+        """
+        reason = explain_not_repeatable(log, own_laws=own_laws)
+        if reason:
+            raise NotRepeatable(f"twins cannot be run: {reason}")
+        return _run_twins(
+            scenario=log.scenario,
+            pushes=pushes,
+            ticks=[len(log[name]) for name in log.scenario.names],
+            inputs=read_run_inputs(log),
+            log=log,
+        )
+
+    @classmethod
+    def of_scenario(
+        cls, scenario: Scenario, pushes: Sequence[Push], duration_s: float
+    ) -> "Twins":
+        """Simulates an experiment, and repeats it with small pushes to see whether they grow.
+
+        A repetition with a push is called a twin. There is one twin for each push. The run and
+        its twins are simulated faster than real time.
+
+        Args:
+            scenario: Description of the experiment.
+            pushes: Small displacements of the state of the arms, one for each twin.
+            duration_s: Duration of the run, in s.
+
+        Returns:
+            The difference between each twin and the run, over time.
+
+        Raises:
+            ScenarioError: The scenario cannot be simulated.
+            NotRepeatable: A push is before the start or after the end of the run.
+        """
+        rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+        ticks = [max(1, round(duration_s * rate_hz)) for rate_hz in rates_hz]
+        return _run_twins(scenario, pushes, ticks)
 
 
 def _list_joints(scenario: Scenario) -> tuple[str, ...]:
@@ -146,47 +297,6 @@ def _list_joints(scenario: Scenario) -> tuple[str, ...]:
     return tuple(joints)
 
 
-def choose_pushes(scenario: Scenario, count: int | None = None) -> list[Push]:
-    """Chooses pushes that together can reveal every kind of instability.
-
-    A push is a small displacement of the state of a twin, which is a second execution of the
-    run. Different pushes displace different joints or estimates:
-
-    - one push of all estimated parameters if the control law of a site estimates any;
-    - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`. The
-      sizes differ, because growth may depend on the amplitude;
-    - one push of each joint, because a joint that does not act on the others shows its growth
-      clearly only if it is pushed itself.
-
-    If there are not enough pushes for all joints, the joints are not pushed one by one, but all
-    together in several random directions.
-
-    Args:
-        scenario: Description of the experiment.
-        count: Number of pushes. None for one push of each joint and the others above, up to
-            `MAX_PUSHES`.
-    """
-    # The target of "m1 joint 1" is "m1.q1".
-    joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
-    learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
-    complete_count = len(joint_targets) + 2
-    if count is None:
-        count = min(complete_count, MAX_PUSHES)
-
-    pushes = []
-    if learns and count > 2:
-        pushes.append(parse_push(scenario, "theta"))
-    if count < complete_count:
-        numbers = range(1, count - len(pushes) + 1)
-        pushes += [_push_in_random_direction(scenario, number) for number in numbers]
-    else:
-        random_count = min(3, count - len(joint_targets) - len(pushes))
-        factors = (1.0, 1e-3, 1e3)[:random_count]
-        pushes += [parse_push(scenario, "q", factor * PUSH_RAD) for factor in factors]
-        pushes += [parse_push(scenario, target) for target in joint_targets]
-    return [push._replace(again=True, largest=LARGEST) for push in pushes]
-
-
 def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
     """Returns a push of all joints in a random direction.
 
@@ -195,7 +305,7 @@ def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
         number: Number of the direction, counted from 1. Different numbers have different
             directions.
     """
-    push = parse_push(scenario, "q")
+    push = Push.parse(scenario, "q")
     generator = np.random.Generator(np.random.Philox(number))
     directions = generator.uniform(-1.0, 1.0, push.by.shape)
     by = np.where(push.by != 0.0, PUSH_RAD * directions, 0.0)
@@ -208,65 +318,6 @@ MOST_PUSH = 1.0
 """Largest size of a push. A larger push would not be a small disturbance."""
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 """Matches the target of a push: optional site, kind, and optional number, counted from 1."""
-
-
-def parse_push(
-    scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
-) -> Push:
-    """Converts a user's description of a push to the push.
-
-    A push is a small displacement of the state of a twin, which is a second execution of the
-    run. Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of joint
-    2), "m2.theta3" (estimate 3) and "m1.q". Without a number, all joints or estimates of the
-    site are pushed in a random direction. Without a site, those of all sites are.
-
-    The twin is pushed only once. A push that is itself larger than `LARGEST` is never scaled
-    down.
-
-    Args:
-        scenario: Description of the experiment.
-        target: Description of what is pushed, for example "m1.q1".
-        size: Size of the push, in rad, rad/s, or the unit of an estimate.
-        at_s: Time of the push, in s after the epoch (the common start time).
-
-    Raises:
-        UsageError: The scenario has no such target, or the size is out of range.
-    """
-    match = _TARGET.fullmatch(target)
-    if match is None:
-        raise UsageError(_describe_targets(scenario, target))
-
-    site, kind, number = match.groups()
-    counts = _count_estimates(scenario) if kind == "theta" else _count_joints(scenario)
-    owners = []  # indices of the sites that are pushed
-    for i, name in enumerate(scenario.names):
-        if site in (None, name) and counts[i] >= int(number or 1):
-            owners.append(i)
-    if not owners or (number and not site):
-        raise UsageError(_describe_targets(scenario, target))
-    if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
-        raise UsageError(
-            f"--push {target}={size:g}: the size of a push must be from {LEAST_PUSH:g} "
-            f"to {MOST_PUSH:g}"
-        )
-
-    generator = np.random.Generator(np.random.Philox(0))
-    displacements = np.zeros((len(counts), max(counts)))
-    for i in owners:
-        if number:
-            direction = np.arange(counts[i]) == int(number) - 1
-        else:
-            direction = generator.uniform(-1.0, 1.0, counts[i])
-        displacements[i, : counts[i]] = size * direction
-
-    return Push(
-        name=f"{size:g} {_describe_target(site, kind, number)}",
-        field="theta_hat" if kind == "theta" else kind,
-        by=displacements,
-        at_s=at_s,
-        again=False,
-        largest=LARGEST if abs(size) < LARGEST else math.inf,
-    )
 
 
 def _describe_target(site: str | None, kind: str, number: str | None) -> str:
@@ -308,56 +359,6 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
         f"--push {target}: there is no such number; name a number as in {examples}, or q; "
         f"the sites are {sites_text}"
     )
-
-
-def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
-    """Repeats the run of a log, together with a twin for every push.
-
-    A twin is a further execution of the run that receives a small push. The differences between
-    the twins and the run show whether small disturbances grow or die away.
-
-    Args:
-        log: Log of the run.
-        pushes: Small displacements of the state, one for each twin.
-        own_laws: True if control laws that are code of users may run.
-
-    Raises:
-        NotRepeatable: The run cannot be repeated, or the repeated run differs from the records.
-        LogError: A record cannot be read.
-    """
-    reason = explain_not_repeatable(log, own_laws=own_laws)
-    if reason:
-        raise NotRepeatable(f"twins cannot be run: {reason}")
-    return _run_twins(
-        scenario=log.scenario,
-        pushes=pushes,
-        ticks=[len(log[name]) for name in log.scenario.names],
-        inputs=read_run_inputs(log),
-        log=log,
-    )
-
-
-def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
-    """Simulates an experiment, and repeats it with small pushes to see whether they grow.
-
-    A repetition with a push is called a twin. There is one twin for each push. The run and its
-    twins are simulated faster than real time.
-
-    Args:
-        scenario: Description of the experiment.
-        pushes: Small displacements of the state of the arms, one for each twin.
-        duration_s: Duration of the run, in s.
-
-    Returns:
-        The difference between each twin and the run, over time.
-
-    Raises:
-        ScenarioError: The scenario cannot be simulated.
-        NotRepeatable: A push is before the start or after the end of the run.
-    """
-    rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
-    ticks = [max(1, round(duration_s * rate_hz)) for rate_hz in rates_hz]
-    return _run_twins(scenario, pushes, ticks)
 
 
 LANE_SITE_TICKS = 100_000_000

@@ -22,42 +22,54 @@ from typing import Any, NamedTuple
 import msgspec
 
 from .. import process
-from ..core.life.live_hand import TAKEN
-from ..core.step.site_step import Site
-from ..core.step.ticks import (
-    NS_PER_S,
-    Arrival,
+from ..core import (
+    TAKEN,
     CoreChange,
-    Mode,
     PlantState,
+    Site,
     TickInput,
-    TickRecord,
     describe_divergence,
     describe_mode,
 )
 from ..errors import CodeFailed, count_nouns
 from ..hooks import find_hook
-from ..log.accounting import Account
-from ..log.log_file import LogFile
-from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
-from ..log.log_reader import Log
-from ..log.log_writer import LogWriter
-from ..log.mcap_reader import read_contents
-from ..log.mcap_writer import Sink
-from ..log.message_identity import compute_virtual_boot
-from ..log.provenance import collect_provenance
-from ..log.view_rates import VIZ_HZ
-from ..net import topics
-from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
-from ..net.timing import LoopStats
-from ..net.topics import number_message, skipped_numbers
-from ..net.wire import encode, encode_state
-from ..own_code.imported_code import ImportedLaw
+from ..log import (
+    MAX_TIME_NS,
+    SITE_CHANNELS,
+    VIZ_HZ,
+    Account,
+    Log,
+    LogFile,
+    LogWriter,
+    Sink,
+    collect_provenance,
+    compute_virtual_boot,
+    read_contents,
+)
+from ..net import (
+    SENT_TIME_SINCE,
+    VERSION,
+    Event,
+    LinkStats,
+    LoopStats,
+    State,
+    encode,
+    encode_state,
+    number_message,
+    skipped_numbers,
+    topics,
+)
+from ..own_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
-from ..scenario import Scenario
-from ..scenario.operators.program_hand import POLICY, make_hand_players
-from ..scenario.plant_player import PlantPlayer, make_plant_players
-from ..scenario.validate import refuse_external_arms
+from ..records import NS_PER_S, Arrival, Mode, TickRecord
+from ..scenario import (
+    POLICY,
+    PlantPlayer,
+    Scenario,
+    make_hand_players,
+    make_plant_players,
+    refuse_external_arms,
+)
 from .resumption import read_output, select_peer_channels
 from .virtual_network import Network, PromptNetwork
 

@@ -21,16 +21,14 @@ import msgspec
 import numpy as np
 
 from .. import process
-from ..core.step.site_step import Site
-from ..core.step.ticks import NS_PER_S, PlantState, TickRecord
+from ..core import PlantState, Site
 from ..errors import LawFailed, LogError
-from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from ..log.site_log import SiteLog
+from ..log import Log, Progress, SiteLog
+from ..records import NS_PER_S, TickRecord
 from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
-from .verify import (
+from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
     describe_law_failure,

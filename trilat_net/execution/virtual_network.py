@@ -25,9 +25,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, TickRecord
+from ..core import MAX_ARRIVALS
 from ..errors import LogError, count_nouns
-from ..log.site_log import SiteLog
+from ..log import SiteLog
+from ..records import NS_PER_S, Arrival, TickRecord
 from .resumption import ArrivalEntry, make_arrival
 
 

@@ -9,3 +9,82 @@ Invariant:
       `torque` is compiled, so it loops over numbers and creates no lists.
     - Other modules find the laws by listing this folder, see `scenario.laws`.
 """
+
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # Laws
+    "PD",
+    "Adaptive",
+    "complementary_shares",
+    # The interface of a law
+    "DAMPING",
+    "ERROR_DAMPING",
+    "ControlLaw",
+    "GainRange",
+    "LawSettings",
+    "SentVectorSpecs",
+    "TuningRun",
+    "TuningSite",
+    "check_law_class",
+    "convert_sends",
+    "format_class_name",
+    "make_instance",
+    # Conditions of stability
+    "COMMON_MOTION_SHARE",
+    "ArmLoad",
+    "BlockKey",
+    "LawSituation",
+    "LinearForm",
+    "LinearSituation",
+    "StabilityCondition",
+    "find_least_reversible",
+]
+
+if TYPE_CHECKING:
+    from .adaptive import Adaptive
+    from .conditions import (
+        COMMON_MOTION_SHARE,
+        ArmLoad,
+        BlockKey,
+        LawSituation,
+        LinearForm,
+        LinearSituation,
+        StabilityCondition,
+        find_least_reversible,
+    )
+    from .interface import (
+        DAMPING,
+        ERROR_DAMPING,
+        ControlLaw,
+        GainRange,
+        LawSettings,
+        TuningRun,
+        TuningSite,
+        check_law_class,
+        format_class_name,
+        make_instance,
+    )
+    from .p_d import PD
+    from .sent_vectors import SentVectorSpecs, convert_sends
+    from .six_channel import complementary_shares
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "adaptive": "Adaptive",
+            "conditions": (
+                "ArmLoad BlockKey COMMON_MOTION_SHARE LawSituation LinearForm "
+                "LinearSituation StabilityCondition find_least_reversible"
+            ),
+            "interface": (
+                "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun "
+                "TuningSite check_law_class format_class_name make_instance"
+            ),
+            "p_d": "PD",
+            "sent_vectors": "SentVectorSpecs convert_sends",
+            "six_channel": "complementary_shares",
+        },
+    )

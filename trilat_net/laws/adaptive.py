@@ -23,8 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law
 from ..fields import (
     NotNegativeCoordinates,
     NotNegativeParameters,

@@ -15,8 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.step.site_setup import Gains
-from ..core.step.vectors import Array
+from ..core import Array, Gains
 from ..errors import ScenarioError
 from ..fields import MAX_QUANTITY, Parameters
 from .adaptive import Adaptive

@@ -39,12 +39,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.arms.elementary import sincos
-from ..core.arms.two_link_arm import regressor
-from ..core.plug.compiled_law import compiled
-from ..core.plug.user_law import LawContext, LawInput
-from ..core.step.jit import leaf
-from ..core.step.vectors import Pair
+from ..core import LawContext, LawInput, Pair, compiled, leaf, regressor, sincos
 from ..fields import NotNegative, NotNegativeParameters, Parameters, Positive, PositiveJoints
 from .conditions import LawSituation, StabilityCondition
 from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlLaw, TuningSite

@@ -14,9 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.step.control import ROBUST_RESIDUE
-from ..core.step.site_setup import Gains
-from ..core.step.vectors import Array
+from ..core import ROBUST_RESIDUE, Array, Gains
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
 from .adaptive_box import AdaptiveBox
 from .conditions import LawSituation, StabilityCondition

@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.links.dominance import find_balancing_weights
-from ..core.step.vectors import Array
+from ..core import Array, find_balancing_weights
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
 """The premise of each law that balances energy, as part of a sentence."""

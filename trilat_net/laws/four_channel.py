@@ -19,10 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.plug.compiled_law import compiled
-from ..core.plug.user_law import LawContext, LawInput
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law, LawContext, LawInput, compiled
 from ..fields import Joints, NotNegative, NotNegativeJoints, PositiveJoints, Share
 from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, ControlLaw

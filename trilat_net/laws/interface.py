@@ -25,9 +25,7 @@ from typing import Any, ClassVar, NamedTuple, cast, get_origin
 import msgspec
 from msgspec.structs import asdict
 
-from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law, LawContext, UserLaw, UserLawFactory
 from ..errors import ScenarioError, count_nouns, describe_exception
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page

@@ -13,8 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law
 from ..fields import NotNegative, NotNegativeJoints, PositiveCoordinates
 from .conditions import LawSituation, StabilityCondition, judge_position_exchange
 from .interface import DAMPING, STIFFNESS, ControlLaw

@@ -15,8 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law
 from ..errors import ScenarioError, count_nouns
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints
 from .conditions import LawSituation

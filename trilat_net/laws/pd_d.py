@@ -13,8 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints, PositiveCoordinates
 from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 

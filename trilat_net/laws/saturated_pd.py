@@ -14,11 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..core.arms.elementary import tanh
-from ..core.plug.compiled_law import compiled
-from ..core.plug.user_law import LawInput
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law, LawInput, compiled, tanh
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
 from .conditions import LawSituation, StabilityCondition, judge_position_exchange
 from .interface import DAMPING, STIFFNESS, ControlLaw

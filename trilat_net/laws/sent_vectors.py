@@ -15,10 +15,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from ..core.arms.chain import MAX_JOINTS
-from ..core.plug.law_channel import MAX_SENT
+from ..core import MAX_SENT
 from ..errors import ScenarioError
 from ..fields import Frozen, reword_problem, split_refusal
+from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):

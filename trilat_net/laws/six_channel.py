@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..core.step.vectors import Array
+from ..core import Array
 from .conditions import LawSituation, StabilityCondition
 from .four_channel import FourChannel
 

@@ -21,11 +21,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.arms.two_link_arm import regressor
-from ..core.plug.compiled_law import compiled
-from ..core.plug.user_law import LawContext, LawInput
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import Array, Gains, Law, LawContext, LawInput, compiled, regressor
 from ..fields import NotNegativeParameters, Parameters, PositiveJoints
 from .conditions import LawSituation, StabilityCondition
 from .interface import (

@@ -19,9 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.plug.compiled_law import compiled
-from ..core.plug.law_energy import LawEnergies, LawRecords, sum_work
-from ..core.plug.user_law import LawContext, LawInput
+from ..core import LawContext, LawEnergies, LawInput, LawRecords, compiled, sum_work
 from ..fields import NotNegative, NotNegativeJoints, Positive, PositiveJoints
 from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw

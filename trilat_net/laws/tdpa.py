@@ -29,9 +29,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ..core.plug.compiled_law import compiled
-from ..core.plug.law_energy import LawEnergies, LawRecords, sum_work
-from ..core.plug.user_law import LawContext, LawInput
+from ..core import LawContext, LawEnergies, LawInput, LawRecords, compiled, sum_work
 from ..fields import NotNegative, NotNegativeJoints, Positive
 from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw

@@ -39,12 +39,18 @@ from typing import Any, ClassVar, Literal, cast
 import numpy as np
 from msgspec.structs import replace
 
-from ..core.links.dominance import find_balancing_weights
-from ..core.plug.compiled_law import compiled
-from ..core.plug.law_energy import LawEnergies, LawRecords, sum_work
-from ..core.plug.user_law import LawContext, LawInput
-from ..core.step.site_setup import Gains, Law
-from ..core.step.vectors import Array
+from ..core import (
+    Array,
+    Gains,
+    Law,
+    LawContext,
+    LawEnergies,
+    LawInput,
+    LawRecords,
+    compiled,
+    find_balancing_weights,
+    sum_work,
+)
 from ..fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
 from .conditions import (
     PASSIVE_OUTSIDE,

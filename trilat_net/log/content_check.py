@@ -25,11 +25,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-from ..core.step.ticks import tick_ns
+from ..core import tick_ns
 from ..errors import WireError
-from ..net import messages, topics
-from ..net.topics import number_message
-from ..net.wire import decode
+from ..net import MODES, READABLE, Event, LinkStats, State, decode, number_message, topics
 from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
@@ -100,16 +98,16 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
         payload = data[begin + MESSAGE_HEAD.size : end]
         # The type of the message is unknown, so that all types are tried. A payload can be
         # decoded as its own type only. Any other type raises a WireError.
-        kinds: tuple[Any, ...] = (messages.State, messages.LinkStats, messages.Event)
+        kinds: tuple[Any, ...] = (State, LinkStats, Event)
         for kind in kinds:
             with suppress(WireError):
-                message: AnyMessage = decode(payload, kind, messages.READABLE)
+                message: AnyMessage = decode(payload, kind, READABLE)
                 # The rate affects only the number of the message, which is not used here.
                 any_rate_hz = 1
                 identity = identify_message(message, any_rate_hz)
                 boots.add((identity.sender, message.boot))
                 sent_since_epoch_ns = identity.sent_ns
-                if isinstance(message, messages.Event):
+                if isinstance(message, Event):
                     states_epoch = bool(message.epoch_unix_ns)
                     if states_epoch:
                         epochs_ns.add(message.epoch_unix_ns)
@@ -211,7 +209,7 @@ class ContentCheck:
         kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
         for kind in kinds:
             try:
-                message: AnyMessage = decode(payload, kind, messages.READABLE)
+                message: AnyMessage = decode(payload, kind, READABLE)
             except WireError:
                 continue
             identity = identify_message(message, 1)
@@ -296,7 +294,7 @@ class ContentCheck:
             layout = self._scenario.layout(member)
             rate_hz = self._scenario.sites[member].rate_hz
         try:
-            message = decode(payload, kind, messages.READABLE, layout)
+            message = decode(payload, kind, READABLE, layout)
         except WireError as error:
             raise UnreadableRecord(f"a message of {topic} cannot be read: {error}") from None
         return message, identify_message(message, rate_hz)
@@ -333,7 +331,7 @@ class ContentCheck:
             )
         number = sequence if identity.number < 0 else identity.number
         self._check_number(topic, message, number)
-        if isinstance(message, messages.State):
+        if isinstance(message, State):
             self._check_tick(topic, message)
         if identity.sent_ns is not None:
             sent_ns = min(max(0, self._epoch_ns + identity.sent_ns), MAX_TIME_NS)
@@ -392,7 +390,7 @@ class ContentCheck:
             UnreadableRecord: The number is not the next one.
         """
         member, channel = topic.split("/")[-2:]
-        if isinstance(message, messages.Event) and message.n < 0:
+        if isinstance(message, Event) and message.n < 0:
             return  # events of old logs have no number
         if topic not in self._latest:
             may_continue = self._is_continued or self._scenario.sites_may_return
@@ -403,7 +401,7 @@ class ContentCheck:
         previous_sequence, _ = self._latest[topic]
         rate_hz = self._scenario.sites[member].rate_hz if member in self._scenario.sites else 1
         expected = number_message(channel, previous_sequence, rate_hz) + 1
-        if isinstance(message, messages.State):
+        if isinstance(message, State):
             # The changes in a record state how many ticks the site skipped before it.
             expected += count_skipped_ticks(message.cmd)
         if number != expected:
@@ -411,7 +409,7 @@ class ContentCheck:
                 f"message {number} of {topic} stands where message {expected} was expected"
             )
 
-    def _check_tick(self, topic: str, record: messages.State) -> None:
+    def _check_tick(self, topic: str, record: State) -> None:
         """Checks that the content of a record is possible in a run of the scenario.
 
         The tick must exist and have its nominal time, the peers must exist, and the mode must
@@ -443,5 +441,5 @@ class ContentCheck:
             raise UnreadableRecord(
                 f"tick {record.tick} of {topic} names a peer that does not exist"
             )
-        if record.mode not in messages.MODES:
+        if record.mode not in MODES:
             raise UnreadableRecord(f"tick {record.tick} of {topic} has an unknown mode")

@@ -32,14 +32,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arms.chain import LINK_PARAMETERS
-from ..core.arms.task_space import POSE, POSITION
+from ..core import LINK_PARAMETERS, POSE, POSITION
 from ..errors import LogError
 from ..files import import_extra
-from ..net.messages import Event, LinkStats, State, json_schema
+from ..net import Event, LinkStats, State, json_schema
 from ..records import NS_PER_S
-from ..scenario import Scenario
-from ..scenario.arms import TASK_AXES, ArmModel
+from ..scenario import TASK_AXES, ArmModel, Scenario
 from .orientations import QUATERNION_AXES, align_signs, compute_quaternions
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
@@ -173,6 +171,27 @@ class Table:
     def label(self) -> str:
         """Name of the table for file names, such as "m1_link", or "events" for all sites."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
+
+    def to_data_frame(self) -> "polars.DataFrame":
+        """Converts a table of a log to a polars data frame with the same columns.
+
+        A missing value is null.
+
+        Raises:
+            UsageError: polars is not installed.
+        """
+        pl = import_extra("polars", "frames", "data frames")
+        all_series = []
+        for column in self.columns:
+            if column.is_text:
+                series = pl.Series(column.name, column.values.tolist(), pl.String)
+            else:
+                series = pl.Series(column.name, column.values, None)
+            if column.known is not None:
+                null = pl.Series([None], dtype=series.dtype)
+                series = series.zip_with(pl.Series(column.known), null)
+            all_series.append(series)
+        return cast("polars.DataFrame", pl.DataFrame(all_series))
 
 
 # An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
@@ -821,28 +840,3 @@ def to_pandas_frame(table: Table) -> "pandas.DataFrame":
         else:
             values[column.name] = column.numbers()
     return import_extra("pandas", "frames", "data frames").DataFrame(values)
-
-
-def to_data_frame(table: Table) -> "polars.DataFrame":
-    """Converts a table of a log to a polars data frame with the same columns.
-
-    A missing value is null.
-
-    Args:
-        table: The table.
-
-    Raises:
-        UsageError: polars is not installed.
-    """
-    pl = import_extra("polars", "frames", "data frames")
-    all_series = []
-    for column in table.columns:
-        if column.is_text:
-            series = pl.Series(column.name, column.values.tolist(), pl.String)
-        else:
-            series = pl.Series(column.name, column.values, None)
-        if column.known is not None:
-            null = pl.Series([None], dtype=series.dtype)
-            series = series.zip_with(pl.Series(column.known), null)
-        all_series.append(series)
-    return cast("polars.DataFrame", pl.DataFrame(all_series))

@@ -23,9 +23,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import LogRefused, UsageError, count_nouns
-from ..files import describe_write_error, publish_file, refuse_existing, sync_folder
-from ..net import topics
-from ..net.clock import SystemClock
+from ..files import describe_write_error, publish_file, refuse_existing
+from ..net import SystemClock, topics
 from .log_layout import active_path
 from .mcap_records import MAGIC
 
@@ -196,6 +195,23 @@ _ADVICE = {
     errno.EROFS: ("the disk has become read-only", _ELSEWHERE),
 }
 """Problem and advice for the user, by the error number of the disk."""
+
+
+def sync_folder(folder: Path) -> None:
+    """Writes the entries of a folder to the disk, so that its files survive a loss of power.
+
+    Without this, a file may be stored completely, but its name may be lost. Nothing happens on
+    platforms that do not support this.
+
+    Args:
+        folder: The folder.
+    """
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 class LogFile:

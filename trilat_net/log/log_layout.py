@@ -19,9 +19,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import UsageError
-from ..net import topics
-from ..net.bus import matches_key
-from ..net.messages import Event, LinkStats, RecorderStats, State
+from ..net import Event, LinkStats, RecorderStats, State, matches_key, topics
 
 ACTIVE_SUFFIX = ".active"
 """Suffix of a log's file name while the log is being recorded."""
@@ -137,35 +135,35 @@ class ChannelFilter:
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}
 
+    @classmethod
+    def parse(cls, include: Collection[str], exclude: Collection[str]) -> "ChannelFilter":
+        """Parses the options `--include` and `--exclude` of a command.
+
+        A leading slash, as in topics, is ignored.
+
+        Args:
+            include: Key expressions of `--include`.
+            exclude: Key expressions of `--exclude`.
+
+        Raises:
+            UsageError: A string is not a key expression and would match no channel.
+        """
+        for option, texts in (("--include", include), ("--exclude", exclude)):
+            for text in texts:
+                if not all(map(_CHUNK.fullmatch, text.strip("/").split("/"))):
+                    raise UsageError(
+                        f"{option} must be a key expression such as 'trilat/*/m1/**' or "
+                        f"'**/link', not {text!r}: * stands for one name, ** for any number of "
+                        "names, and $* for part of a name"
+                    )
+        return ChannelFilter(
+            include=tuple(text.strip("/") for text in include),
+            exclude=tuple(text.strip("/") for text in exclude),
+        )
+
 
 ALL_CHANNELS = ChannelFilter()
 """The filter that records all channels."""
-
-
-def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> ChannelFilter:
-    """Parses the options `--include` and `--exclude` of a command.
-
-    A leading slash, as in topics, is ignored.
-
-    Args:
-        include: Key expressions of `--include`.
-        exclude: Key expressions of `--exclude`.
-
-    Raises:
-        UsageError: A string is not a key expression and would match no channel.
-    """
-    for option, texts in (("--include", include), ("--exclude", exclude)):
-        for text in texts:
-            if not all(map(_CHUNK.fullmatch, text.strip("/").split("/"))):
-                raise UsageError(
-                    f"{option} must be a key expression such as 'trilat/*/m1/**' or '**/link', "
-                    f"not {text!r}: * stands for one name, ** for any number of names, and $* "
-                    "for part of a name"
-                )
-    return ChannelFilter(
-        include=tuple(text.strip("/") for text in include),
-        exclude=tuple(text.strip("/") for text in exclude),
-    )
 
 
 def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:

@@ -36,8 +36,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from ..core.links.delay import MAX_DELAY_US
-from ..core.step.ticks import NS_PER_S, CoreChange
+from ..core import MAX_DELAY_US, CoreChange
 from ..errors import (
     LogError,
     ScenarioError,
@@ -49,16 +48,27 @@ from ..errors import (
 )
 from ..files import describe_missing_library, open_regular
 from ..hooks import find_hook
-from ..net import topics
-from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
-from ..net.topics import count_under_way
-from ..net.wire import decode
-from ..own_code.code_consent import LawFiles, allow_logged_code
+from ..net import (
+    READABLE,
+    Event,
+    LinkStats,
+    RecorderStats,
+    State,
+    count_under_way,
+    decode,
+    topics,
+)
+from ..own_code import LawFiles, allow_logged_code
+from ..records import NS_PER_S
 from ..results import Result
-from ..scenario import Scenario, parse_core_change, parse_embedded
-from ..scenario.delay_traces import TracePoint
-from ..scenario.operators.program_hand import FAILED_HAND
-from ..scenario.sample_uses import PictureDelay
+from ..scenario import (
+    FAILED_HAND,
+    PictureDelay,
+    Scenario,
+    TracePoint,
+    parse_core_change,
+    parse_embedded,
+)
 from .accounting import LAST, describe_unknown_ends
 from .data_tables import (
     EVENTS_TABLE,
@@ -68,7 +78,6 @@ from .data_tables import (
     build_events_table,
     build_link_table,
     build_state_table,
-    to_data_frame,
     to_pandas_frame,
 )
 from .log_layout import (
@@ -921,7 +930,7 @@ class Log(Result, Mapping[str, SiteLog]):
         Raises:
             UsageError: polars is not installed.
         """
-        return to_data_frame(self.table(name, kind))
+        return self.table(name, kind).to_data_frame()
 
 
 def open_log(

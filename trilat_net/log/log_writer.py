@@ -22,8 +22,7 @@ from typing import Any, Protocol
 
 from ..errors import LogRefused, UsageError
 from ..files import refuse_existing
-from ..net import topics
-from ..net.messages import VERSION, Event, LinkStats, State, json_schema
+from ..net import VERSION, Event, LinkStats, State, json_schema, topics
 from ..records import TickRecord
 from . import log_layout
 from .log_file import LogFile
@@ -415,28 +414,6 @@ class LogStorage:
                 "with --continue, or replace it with --force"
             )
         return int(self.splits), ""
-
-
-def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Parses an option of a command that limits the parts of a log.
-
-    Args:
-        option: Name of the option, for the error message.
-        unit: Name of the option's unit, for the error message.
-        number: Value of the option. None if the option is absent.
-        scale: Bytes or ns per unit.
-
-    Returns:
-        The limit in bytes or ns. None if the option is absent.
-
-    Raises:
-        UsageError: The number is not from 1 to 1e6.
-    """
-    if number is None:
-        return None
-    if not 1.0 <= number <= 1e6:
-        raise UsageError(f"{option} must be a number of {unit} from 1 to 1e6, not {number:g}")
-    return int(number * scale)
 
 
 class LogParts:

@@ -132,7 +132,7 @@ class McapMessage(NamedTuple):
     sequence: int
 
 
-class MessageBlock(NamedTuple):
+class _MessageBlock(NamedTuple):
     """Messages of one topic that follow each other in a chunk.
 
     Attributes:
@@ -186,7 +186,7 @@ class MessageBlock(NamedTuple):
         return ends, times
 
 
-def _make_single_block(message: McapMessage) -> MessageBlock:
+def _make_single_block(message: McapMessage) -> _MessageBlock:
     """Returns a block of one message."""
     length = len(message.payload)
     run = chunk_walk.allocate_run(1)
@@ -196,7 +196,7 @@ def _make_single_block(message: McapMessage) -> MessageBlock:
     run.counts[0] = 1
     run.lengths[0] = length
     chunk = np.frombuffer(message.payload, np.uint8)
-    return MessageBlock(message.topic, chunk, run, listed=1, slot=0)
+    return _MessageBlock(message.topic, chunk, run, listed=1, slot=0)
 
 
 _BLOCK_BYTES = 1 << 12
@@ -308,7 +308,7 @@ class McapReader:
             except mcap_records.UnreadableRecord as error:
                 self._note_damage(item.frame, error)
 
-    def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[MessageBlock]:
+    def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[_MessageBlock]:
         """Yields the messages of some topics in blocks, as `messages` finds them.
 
         Args:
@@ -548,7 +548,7 @@ class McapReader:
 
     def _read_blocks(
         self, record: mcap_records.ScannedRecord, is_kept: Callable[[str], bool]
-    ) -> Iterator[MessageBlock]:
+    ) -> Iterator[_MessageBlock]:
         """Yields the messages of a record in blocks, and stores its schemas and channels.
 
         Args:
@@ -626,7 +626,7 @@ class McapReader:
         count: int,
         run: chunk_walk.MessageRun,
         is_kept: Callable[[str], bool],
-    ) -> Iterator[MessageBlock]:
+    ) -> Iterator[_MessageBlock]:
         """Yields messages that a walk has found, a block for each channel, without the others.
 
         Args:
@@ -640,7 +640,7 @@ class McapReader:
         for slot in present[np.argsort(run.firsts[present])].tolist():
             topic = self._topics[self._slots[slot]]
             if is_kept(topic):
-                yield MessageBlock(topic, chunk, run, count, slot)
+                yield _MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
         """Compares the file with its digests, to find out whether it was changed.
@@ -843,7 +843,7 @@ class ChannelMessages:
         self.log_ns.append(log_ns)
         self.publish_ns.append(publish_ns)
 
-    def add_block(self, block: MessageBlock) -> None:
+    def add_block(self, block: _MessageBlock) -> None:
         """Adds the next messages of the topic.
 
         Args:

@@ -19,9 +19,7 @@ from contextlib import suppress
 from typing import Any
 
 from ..errors import LogError, WireError
-from ..net import topics
-from ..net.messages import READABLE, Event, LinkStats, RecorderStats
-from ..net.wire import decode
+from ..net import READABLE, Event, LinkStats, RecorderStats, decode, topics
 from .log_layout import ACCOUNTS, PART
 from .mcap_reader import ChannelMessages, LogContents
 from .record_columns import decode_ticks

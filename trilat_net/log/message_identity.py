@@ -12,10 +12,17 @@ Invariant:
 import hashlib
 from typing import NamedTuple
 
-from ..net import messages, topics
-from ..net.topics import number_message
+from ..net import (
+    SENT_TIME_SINCE,
+    Event,
+    LinkStats,
+    RecorderStats,
+    State,
+    number_message,
+    topics,
+)
 
-AnyMessage = messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
+AnyMessage = State | LinkStats | Event | RecorderStats
 """A message of one of the numbered channels, or of the recorder's statistics."""
 
 
@@ -71,8 +78,8 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
         The identity of the message.
     """
     match message:
-        case messages.State():
-            sent_ns = message.sent_ns if message.v >= messages.SENT_TIME_SINCE else message.t_ns
+        case State():
+            sent_ns = message.sent_ns if message.v >= SENT_TIME_SINCE else message.t_ns
             return MessageIdentity(
                 sender=message.site,
                 channel=topics.STATE,
@@ -80,7 +87,7 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
                 sequence=message.tick,
                 sent_ns=sent_ns,
             )
-        case messages.LinkStats():
+        case LinkStats():
             number = number_message(topics.LINK, message.tick, rate_hz)
             return MessageIdentity(
                 sender=message.site,
@@ -89,7 +96,7 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
                 sequence=message.tick,
                 sent_ns=message.t_ns,
             )
-        case messages.Event():
+        case Event():
             # Events before the epoch have no time. The recorder stamps its own events when it
             # receives them.
             is_stamped = message.t_ns >= 0 and message.member != topics.RECORDER
@@ -102,7 +109,7 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
                 sequence=sequence,
                 sent_ns=event_ns,
             )
-        case messages.RecorderStats():
+        case RecorderStats():
             return MessageIdentity(
                 sender=topics.RECORDER,
                 channel=topics.STATS,

@@ -24,9 +24,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.arms.task_space import POSE, POSITION
-from ..core.step.vectors import Array
-from ..scenario.arms import TASK_AXES
+from ..core import POSE, POSITION, Array
+from ..scenario import TASK_AXES
 
 QUATERNION_AXES = ("qw", "qx", "qy", "qz")
 """Names of the four numbers of a quaternion, in tables."""

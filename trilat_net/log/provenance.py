@@ -11,7 +11,7 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-from ..core.step.fingerprint import compute_fingerprint
+from ..core import compute_fingerprint
 from ..files import find_version
 
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")

@@ -21,10 +21,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.step.vectors import Array
+from ..core import Array
 from ..errors import WireError
-from ..net.messages import MODES, READABLE, Stamp, State, TickNumber
-from ..net.wire import MAX_BYTES, decode
+from ..net import MAX_BYTES, MODES, READABLE, Stamp, State, TickNumber, decode
 from ..records import Layout
 
 Ints = NDArray[np.int64]

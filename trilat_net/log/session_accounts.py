@@ -14,10 +14,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 
 from ..errors import ScenarioError, WireError, count_nouns
-from ..net import topics
-from ..net.messages import READABLE, Event
-from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
-from ..net.wire import decode
+from ..net import (
+    READABLE,
+    Event,
+    count_messages,
+    count_under_way,
+    decode,
+    number_message,
+    skipped_numbers,
+    topics,
+)
 from ..scenario import Scenario, parse_embedded
 from .accounting import LAST, SHOWN_GAPS, Account, Coverage, StartGap
 from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS

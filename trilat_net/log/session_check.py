@@ -4,7 +4,7 @@ A log contains the messages of a session in the file format MCAP, and the scenar
 description of the experiment. The bytes of any MCAP file are checked. The content is checked
 only if the file is a log of trilat-net: each message is compared with the place in the file
 where it is stored, with the scenario, and with the earlier messages. The control laws are not
-executed again; `trilat_net.execution.verify` does that.
+executed again; `trilat_net.execution.verification` does that.
 
 Invariant:
     - Each check produces one finding, with the places where the check failed.
@@ -24,8 +24,7 @@ import numpy as np
 
 from ..errors import LogError, ScenarioError, WireError, count_nouns
 from ..files import open_regular
-from ..net import messages, topics
-from ..net.wire import decode
+from ..net import decode, messages, topics
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S
 from ..scenario import Scenario, parse_embedded

@@ -20,13 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import process
-from ..core.arms.task_space import POSE, POSITION
-from ..core.plug.law_channel import LawChannel
-from ..core.step.vectors import Array
+from ..core import POSE, POSITION, Array, LawChannel
 from ..errors import LogError, WireError, count_nouns
 from ..hooks import find_hook
-from ..net.messages import READABLE, State
-from ..net.wire import decode
+from ..net import READABLE, State, decode
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Layout
 from . import record_columns

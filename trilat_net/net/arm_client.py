@@ -33,14 +33,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
 
-from ..core.arms.exogenous import TorqueKind, TorqueSource
-from ..core.life.live_hand import GRIP_NS, SILENCE_NS, HandInForce
-from ..core.step.ticks import RELEASE_REASONS
+from ..core import GRIP_NS, RELEASE_REASONS, SILENCE_NS, HandInForce, TorqueKind, TorqueSource
 from ..errors import UsageError, WireError
 from . import topics
 from .bus import Bus
 from .clock import Clock, SystemClock
-from .connection import Connection, secure_connection
+from .connection import Connection
 from .membership import new_boot, read_messages
 from .messages import Event, State
 from .requests import ArmEnable, ArmMeasurement, HandMessage, Request
@@ -135,6 +133,37 @@ class SiteSender:
             message: Message that `send` has returned.
         """
         self._publish(encode(message))
+
+    @classmethod
+    def for_hand(
+        cls,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        site: str,
+    ) -> "SiteSender":
+        """Returns an object that sends the messages of an operator to a site.
+
+        The operator is identified by a random number in 1 ... 2^32 - 1. Records store the
+        number as a float, which represents these numbers exactly. In a record, the number 0
+        means that no operator moves the arm.
+
+        The operator is the person or program that moves an arm.
+
+        Args:
+            bus: Network connection of the operator's program.
+            clock: Clock of this process.
+            session: Name of the session.
+            site: Name of the site.
+        """
+        return SiteSender(
+            bus=bus,
+            clock=clock,
+            session=session,
+            site=site,
+            channel=topics.HAND,
+            boot=new_boot() % (2**32 - 1) + 1,
+        )
 
 
 class SiteClient:
@@ -324,7 +353,7 @@ class _OutsideClient(SiteClient):
         Raises:
             UsageError: An endpoint or the keys cannot be used.
         """
-        connection = secure_connection(Connection((), list(connect)), keys, insecure=False)
+        connection = Connection((), list(connect)).secure(keys, insecure=False)
         bus = connection.require(cls.member or site).open()
         return cls(bus, SystemClock(), session, site)
 
@@ -438,36 +467,6 @@ class ArmClient(_OutsideClient):
         return tuple(record.tau)
 
 
-def make_hand_sender(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    site: str,
-) -> SiteSender:
-    """Returns an object that sends the messages of an operator to a site.
-
-    The operator is identified by a random number in 1 ... 2^32 - 1. Records store the number as
-    a float, which represents these numbers exactly. In a record, the number 0 means that no
-    operator moves the arm.
-
-    The operator is the person or program that moves an arm.
-
-    Args:
-        bus: Network connection of the operator's program.
-        clock: Clock of this process.
-        session: Name of the session.
-        site: Name of the site.
-    """
-    return SiteSender(
-        bus=bus,
-        clock=clock,
-        session=session,
-        site=site,
-        channel=topics.HAND,
-        boot=new_boot() % (2**32 - 1) + 1,
-    )
-
-
 class Hand(SiteClient):
     """Connection of a person or a program that moves an arm as its operator.
 
@@ -507,7 +506,7 @@ class Hand(SiteClient):
         self._operator = operator
         self._compute_pose = compute_pose
         self._source = source
-        self._sender = make_hand_sender(bus, clock, session, site)
+        self._sender = SiteSender.for_hand(bus, clock, session, site)
         self._message: HandMessage | None = None
         self._lock = threading.Lock()
         self._ended = threading.Event()

@@ -3,7 +3,7 @@
 A session is a run in which several processes ("sites") each control one robot arm. A
 `Connection` consists of the endpoints at which a process listens and to which it connects, its
 mode, and optionally the keys that prove its identity. Opening it returns the bus through which
-messages are sent. `resolve_member_connection` derives the connection from the command line and
+messages are sent. `Connection.of_member` derives the connection from the command line and
 a user's Zenoh file.
 
 Each site of a session has a default endpoint on this machine: a port that follows from the name
@@ -283,49 +283,185 @@ class Connection:
             )
         return self
 
+    @classmethod
+    def of_member(
+        cls,
+        listen: Sequence[str] | None,
+        connect: Sequence[str] | None,
+        routers: Sequence[str] | None,
+        file: ZenohFile | None = None,
+        listen_else: Sequence[str] = (),
+        connect_else: Sequence[str] | None = None,
+        *,
+        routes: bool = False,
+    ) -> "Connection":
+        """Derives the connection of a process from the command line and a user's Zenoh file.
 
-def secure_connection(
-    connection: Connection, keys: "MemberKeys | str | Path | None", *, insecure: bool
-) -> Connection:
-    """Adds a member's keys to a connection, or checks that it is safe without keys.
+        If there is a router (named by `--router`, or if the file has the mode "client"), the
+        process connects only to the router, and does not listen.
 
-    Args:
-        connection: The connection: endpoints, mode and keys of the process.
-        keys: Keys of a member, or the folder that contains them. None if there are no keys.
-        insecure: True to permit endpoints that other machines can reach without keys.
+        Args:
+            listen: Endpoints of the option --listen. None if the option is absent.
+            connect: Endpoints of the option --connect. None if the option is absent.
+            routers: Endpoints of the option --router. None if the option is absent.
+            file: The user's Zenoh file. None if there is none.
+            listen_else: Endpoints at which to listen if neither an option nor the file names
+                any.
+            connect_else: Endpoints to which to connect if neither an option nor the file names
+                any.
+            routes: True if the process is a router itself.
 
-    Returns:
-        The connection, with the keys.
+        Returns:
+            The connection: endpoints and mode, without keys.
 
-    Raises:
-        UsageError: One of three cases: The keys cannot be used. There are keys, but an endpoint
-            is not encrypted or the user's settings contradict the keys. There are no keys,
-            although other machines can reach an endpoint.
-    """
-    if isinstance(keys, str | Path):
-        from .member_keys import read_member_keys  # loads the cryptography package
-
-        keys = read_member_keys(keys)
-    endpoints = (*connection.listen, *(connection.connect or ()))
-    addresses = find_endpoint_addresses(endpoints)
-    for address in addresses:
-        if address.startswith("udp/"):
-            raise UsageError(
-                f"{address}: UDP is not supported, because it can lose or repeat messages and "
-                "does not authenticate their senders: use tcp, tls or quic"
+        Raises:
+            UsageError: The options and the file contradict each other.
+        """
+        file = file or ZenohFile("")
+        if routes:
+            if file.mode not in ("", "router"):
+                raise UsageError(
+                    f"{file.source}: the mode must be router here, not {file.mode}"
+                )
+            return _join_options(
+                listen=listen,
+                connect=connect,
+                file=file,
+                mode="router",
+                listen_else=listen_else,
+                connect_else=(),
             )
-    if keys is None:
-        _check_open_endpoints(connection, insecure=insecure)
-        return connection
-    for address in addresses:
-        _check_encrypted_endpoint(address)
-    _refuse_settings_of_keys(connection.settings)
-    return replace(
-        connection,
-        settings=merge_settings(keys.settings, connection.settings),
-        keys_of=keys.member,
-        keys_end=keys.ends,
-    )
+
+        if file.mode == "router":
+            raise UsageError(
+                f'{file.source}: mode "router" can be used only with `trilat router`; here the '
+                "mode must be peer or client"
+            )
+
+        # Without a router, the process connects to the other members.
+        if not routers and file.mode != "client":
+            return _join_options(
+                listen=listen,
+                connect=connect,
+                file=file,
+                mode="peer",
+                listen_else=listen_else,
+                connect_else=connect_else,
+            )
+
+        # The process is a client of a router.
+        client_source = "--router" if routers else f'{file.source}: mode "client"'
+        if routers and file.mode == "peer":
+            raise UsageError(
+                f'{file.source}: mode "peer" contradicts --router, which requires mode "client"'
+            )
+        if listen is not None or file.endpoints("listen", "client"):
+            raise UsageError(
+                f"{client_source}: a client of a router does not listen on any endpoint; "
+                "leave out the endpoints to listen at"
+            )
+        if routers and connect is not None:
+            raise UsageError(
+                "--router: a client connects only to a router; leave out --connect"
+            )
+
+        for endpoint in routers or ():
+            if not re.fullmatch(
+                r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint
+            ):
+                raise UsageError(
+                    "--router: an endpoint must have a form such as tcp/192.0.2.1:7447, not "
+                    f"{endpoint!r}"
+                )
+
+        endpoints = _merge_endpoints(routers or connect, file, "client", ())
+        if not endpoints:
+            raise UsageError(
+                f"{client_source}: there is no router to connect to; "
+                "name a router with --router"
+            )
+        return Connection((), endpoints, "client", file.settings)
+
+    def secure(self, keys: "MemberKeys | str | Path | None", *, insecure: bool) -> "Connection":
+        """Adds a member's keys to a connection, or checks that it is safe without keys.
+
+        Args:
+            keys: Keys of a member, or the folder that contains them. None if there are no keys.
+            insecure: True to permit endpoints that other machines can reach without keys.
+
+        Returns:
+            The connection, with the keys.
+
+        Raises:
+            UsageError: One of three cases: The keys cannot be used. There are keys, but an
+                endpoint is not encrypted or the user's settings contradict the keys. There are
+                no keys, although other machines can reach an endpoint.
+        """
+        if isinstance(keys, str | Path):
+            from .member_keys import read_member_keys  # loads the cryptography package
+
+            keys = read_member_keys(keys)
+        endpoints = (*self.listen, *(self.connect or ()))
+        addresses = find_endpoint_addresses(endpoints)
+        for address in addresses:
+            if address.startswith("udp/"):
+                raise UsageError(
+                    f"{address}: UDP is not supported, because it can lose or repeat messages "
+                    "and does not authenticate their senders: use tcp, tls or quic"
+                )
+        if keys is None:
+            _check_open_endpoints(self, insecure=insecure)
+            return self
+        for address in addresses:
+            _check_encrypted_endpoint(address)
+        _refuse_settings_of_keys(self.settings)
+        return replace(
+            self,
+            settings=merge_settings(keys.settings, self.settings),
+            keys_of=keys.member,
+            keys_end=keys.ends,
+        )
+
+    def open_bus(
+        self,
+        clock: Clock,
+        stopped: Callable[[], bool],
+        timeout_s: float | None,
+        say: Callable[[str], None],
+    ) -> ZenohBus | None:
+        """Opens a connection, and waits until a router answers if there is one.
+
+        Args:
+            clock: Clock of the caller.
+            stopped: Function that returns True to give up.
+            timeout_s: Longest wait for a router, in s. None waits without a limit.
+            say: Function that prints a line for the user.
+
+        Returns:
+            The bus. None if `stopped` returned True before a router answered.
+
+        Raises:
+            UsageError: An endpoint cannot be used.
+            UnknownHost: A host name cannot be resolved at the first attempt. In later attempts
+                this is ignored, because the name service may be away for some time.
+            SessionError: No router answered in time.
+        """
+        begun_ns = clock.monotonic_ns()
+        has_reported = False
+        while not stopped():
+            try:
+                return self.open()
+            except UnknownHost:
+                if not has_reported:
+                    raise
+            except RouterSilent as silent:
+                if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
+                    raise SessionError(f"{silent} within {timeout_s:g} s") from None
+                if not has_reported:
+                    say(f"{silent} yet; trying again")
+                has_reported = True
+            clock.sleep_until(clock.monotonic_ns() + RETRY_NS)
+        return None
 
 
 def _check_encrypted_endpoint(address: str) -> None:
@@ -441,97 +577,6 @@ def is_loopback(address: str) -> bool:
         return False
 
 
-def resolve_member_connection(
-    listen: Sequence[str] | None,
-    connect: Sequence[str] | None,
-    routers: Sequence[str] | None,
-    file: ZenohFile | None = None,
-    listen_else: Sequence[str] = (),
-    connect_else: Sequence[str] | None = None,
-    *,
-    routes: bool = False,
-) -> Connection:
-    """Derives the connection of a process from the command line and a user's Zenoh file.
-
-    If there is a router (named by `--router`, or if the file has the mode "client"), the
-    process connects only to the router, and does not listen.
-
-    Args:
-        listen: Endpoints of the option --listen. None if the option is absent.
-        connect: Endpoints of the option --connect. None if the option is absent.
-        routers: Endpoints of the option --router. None if the option is absent.
-        file: The user's Zenoh file. None if there is none.
-        listen_else: Endpoints at which to listen if neither an option nor the file names any.
-        connect_else: Endpoints to which to connect if neither an option nor the file names any.
-        routes: True if the process is a router itself.
-
-    Returns:
-        The connection: endpoints and mode, without keys.
-
-    Raises:
-        UsageError: The options and the file contradict each other.
-    """
-    file = file or ZenohFile("")
-    if routes:
-        if file.mode not in ("", "router"):
-            raise UsageError(f"{file.source}: the mode must be router here, not {file.mode}")
-        return _join_options(
-            listen=listen,
-            connect=connect,
-            file=file,
-            mode="router",
-            listen_else=listen_else,
-            connect_else=(),
-        )
-
-    if file.mode == "router":
-        raise UsageError(
-            f'{file.source}: mode "router" can be used only with `trilat router`; here the '
-            "mode must be peer or client"
-        )
-
-    # Without a router, the process connects to the other members.
-    if not routers and file.mode != "client":
-        return _join_options(
-            listen=listen,
-            connect=connect,
-            file=file,
-            mode="peer",
-            listen_else=listen_else,
-            connect_else=connect_else,
-        )
-
-    # The process is a client of a router.
-    client_source = "--router" if routers else f'{file.source}: mode "client"'
-    if routers and file.mode == "peer":
-        raise UsageError(
-            f'{file.source}: mode "peer" contradicts --router, which requires mode "client"'
-        )
-    if listen is not None or file.endpoints("listen", "client"):
-        raise UsageError(
-            f"{client_source}: a client of a router does not listen on any endpoint; "
-            "leave out the endpoints to listen at"
-        )
-    if routers and connect is not None:
-        raise UsageError("--router: a client connects only to a router; leave out --connect")
-
-    for endpoint in routers or ():
-        if not re.fullmatch(
-            r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint
-        ):
-            raise UsageError(
-                "--router: an endpoint must have a form such as tcp/192.0.2.1:7447, not "
-                f"{endpoint!r}"
-            )
-
-    endpoints = _merge_endpoints(routers or connect, file, "client", ())
-    if not endpoints:
-        raise UsageError(
-            f"{client_source}: there is no router to connect to; name a router with --router"
-        )
-    return Connection((), endpoints, "client", file.settings)
-
-
 def _join_options(
     listen: Sequence[str] | None,
     connect: Sequence[str] | None,
@@ -542,7 +587,7 @@ def _join_options(
 ) -> Connection:
     """Derives the connection of a peer or a router from the command line and a Zenoh file.
 
-    The arguments are those of `resolve_member_connection`, and the mode of the process.
+    The arguments are those of `Connection.of_member`, and the mode of the process.
 
     Raises:
         UsageError: Both the command line and the file name endpoints at which to listen.
@@ -585,49 +630,6 @@ def _merge_endpoints(
     endpoints: list[Endpoint] = list(named or ())
     further = [endpoint for endpoint in file_endpoints or () if endpoint not in endpoints]
     return endpoints + further
-
-
-def open_bus(
-    connection: Connection,
-    clock: Clock,
-    stopped: Callable[[], bool],
-    timeout_s: float | None,
-    say: Callable[[str], None],
-) -> ZenohBus | None:
-    """Opens a connection, and waits until a router answers if there is one.
-
-    Args:
-        connection: The connection. Its endpoints must be known.
-        clock: Clock of the caller.
-        stopped: Function that returns True to give up.
-        timeout_s: Longest wait for a router, in s. None waits without a limit.
-        say: Function that prints a line for the user.
-
-    Returns:
-        The bus. None if `stopped` returned True before a router answered.
-
-    Raises:
-        UsageError: An endpoint cannot be used.
-        UnknownHost: A host name cannot be resolved at the first attempt. In later attempts this
-            is ignored, because the name service may be away for some time.
-        SessionError: No router answered in time.
-    """
-    begun_ns = clock.monotonic_ns()
-    has_reported = False
-    while not stopped():
-        try:
-            return connection.open()
-        except UnknownHost:
-            if not has_reported:
-                raise
-        except RouterSilent as silent:
-            if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
-                raise SessionError(f"{silent} within {timeout_s:g} s") from None
-            if not has_reported:
-                say(f"{silent} yet; trying again")
-            has_reported = True
-        clock.sleep_until(clock.monotonic_ns() + RETRY_NS)
-    return None
 
 
 ROUTER_POLL_NS = 50_000_000

@@ -23,7 +23,7 @@ from ..errors import ScenarioError, SessionError, UsageError, WireError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .connection import Connection, default_endpoint, default_endpoints, open_bus
+from .connection import Connection, default_endpoint, default_endpoints
 from .known_sites import find_known_endpoints
 from .membership import MemberQuery, liveliness_token
 from .messages import Event, Info
@@ -141,9 +141,7 @@ def connect_to_session(
 
             Returns None if `stopped` has returned True.
             """
-            bus = open_bus(
-                connection=target, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
-            )
+            bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=timeout_s, say=say)
             return None if bus is None else stack.enter_context(closing(bus))
 
         # A recorder does not use the known sites: it must announce itself to the first site.
@@ -361,17 +359,13 @@ def open_playback_bus(
         UsageError: An endpoint cannot be used.
     """
     try:
-        return open_bus(
-            connection=connection, clock=clock, stopped=stopped, timeout_s=None, say=say
-        )
+        return connection.open_bus(clock=clock, stopped=stopped, timeout_s=None, say=say)
     except UsageError:
         if not connection.listen:
             raise
         # The port may be in use by a site of a session with the same name.
         target = replace(connection, listen=(), connect=connection.listen)
-        session_bus = open_bus(
-            connection=target, clock=clock, stopped=stopped, timeout_s=1.0, say=say
-        )
+        session_bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=1.0, say=say)
         if session_bus is not None:
             with closing(session_bus):
                 refuse_running_session(session_bus, clock, session, stopped)

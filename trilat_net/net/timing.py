@@ -33,8 +33,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..core.step.site_step import Site
-from ..core.step.ticks import NS_PER_S, TickRecord
+from ..core import Site
+from ..records import NS_PER_S, TickRecord
 from .messages import MODE_WORDS, VERSION, LinkStats, PeerSample
 from .offset import (
     DRIFT_LIMIT,

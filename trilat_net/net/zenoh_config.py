@@ -78,8 +78,8 @@ _QUEUES = [
 _CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
 """Zenoh's setting `connect/timeout_ms` by mode: -1 retries without limit, 0 does not retry.
 
-A client cannot open its session without its router. `open_bus` tries again until the router
-runs.
+A client cannot open its session without its router. `Connection.open_bus` tries again until the
+router runs.
 """
 _CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
 """Zenoh's setting `connect/exit_on_failure` by mode."""

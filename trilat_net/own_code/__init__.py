@@ -9,3 +9,81 @@ Invariant:
     - Nothing outside this package imports a module that a scenario or a log names.
     - Nothing here knows the scenarios: a scenario is something with sites that name code.
 """
+
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # Permissions
+    "LawFiles",
+    "allow_logged_code",
+    "allow_own_code",
+    "find_user_laws",
+    "list_imported_code",
+    "may_run_user_laws",
+    # Import
+    "CLASS_PATTERN",
+    "CodeConsent",
+    "CodeConsents",
+    "CodeKey",
+    "ImportedLaw",
+    "NamedCode",
+    "Watch",
+    "allowed_code",
+    "allowing_any_settings",
+    "call_directly",
+    "import_class",
+    "make_own_instance",
+    "name_law_classes",
+    "read_code",
+    # Vectors that a law sends
+    "build_channel",
+    "check_sends",
+    "parse_classes",
+    "read_sends",
+]
+
+if TYPE_CHECKING:
+    from .class_arguments import make_own_instance
+    from .code_consent import (
+        LawFiles,
+        allow_logged_code,
+        allow_own_code,
+        find_user_laws,
+        list_imported_code,
+        may_run_user_laws,
+    )
+    from .imported_code import (
+        CLASS_PATTERN,
+        CodeConsent,
+        CodeConsents,
+        CodeKey,
+        ImportedLaw,
+        NamedCode,
+        Watch,
+        allowed_code,
+        allowing_any_settings,
+        call_directly,
+        import_class,
+        name_law_classes,
+        read_code,
+    )
+    from .sent_channel import build_channel, check_sends, parse_classes, read_sends
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "class_arguments": "make_own_instance",
+            "code_consent": (
+                "LawFiles allow_logged_code allow_own_code find_user_laws "
+                "list_imported_code may_run_user_laws"
+            ),
+            "imported_code": (
+                "CLASS_PATTERN CodeConsent CodeConsents CodeKey ImportedLaw NamedCode Watch "
+                "allowed_code allowing_any_settings call_directly import_class "
+                "name_law_classes read_code"
+            ),
+            "sent_channel": "build_channel check_sends parse_classes read_sends",
+        },
+    )

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import ScenarioError, suggest_nearest
-from ..laws.interface import make_instance
+from ..laws import make_instance
 
 _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
     float: ((int, float), "a number"),

@@ -30,11 +30,10 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast, runtime
 
 from msgspec import Meta, field
 
-from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
+from ..core import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
-from ..laws.interface import LawSettings, check_law_class
-from ..laws.sent_vectors import SentVectorSpecs, convert_sends
+from ..laws import LawSettings, SentVectorSpecs, check_law_class, convert_sends
 from .class_arguments import make_own_instance
 from .sent_channel import parse_classes
 
@@ -94,7 +93,7 @@ class NamedCode(Protocol):
         """Arguments by name with which an object of the user's class is created."""
 
 
-class SiteWithCode(Protocol):
+class _SiteWithCode(Protocol):
     """Interface of a site of a scenario whose parts may be classes of users.
 
     These parts are its control law, its operators and its plant. The checks of permissions look
@@ -118,7 +117,7 @@ class ScenarioWithCode(Protocol):
     """Interface of a scenario, the description of an experiment, that may name classes."""
 
     @property
-    def sites(self) -> Mapping[str, SiteWithCode]:
+    def sites(self) -> Mapping[str, _SiteWithCode]:
         """The sites, each of which is a process that controls one arm, by name."""
 
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
-from ..core.step.site_setup import Layout
+from ..core import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
 from ..errors import ScenarioError, count_nouns
-from ..laws.sent_vectors import SentVectorSpecs, convert_sends
+from ..laws import SentVectorSpecs, convert_sends
+from ..records import Layout
 
 
 def build_channel(sends: SentVectorSpecs, layout: Layout, peers: int) -> LawChannel:

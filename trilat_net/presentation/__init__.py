@@ -5,7 +5,102 @@ Invariant:
       programs that draw nothing start fast.
 """
 
-from ..hooks import register_hooks
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use, register_hooks
+
+__all__ = [
+    # Text
+    "MARKS",
+    "Block",
+    "MarkedText",
+    "TextTable",
+    "compose",
+    "compose_benchmark",
+    "compose_citation",
+    "compose_doctor",
+    "compose_ping",
+    "compose_topic_delays",
+    "describe_judgement",
+    "err",
+    "format_number",
+    "print_error",
+    "print_json",
+    "print_line",
+    "print_table",
+    "terminal_output",
+    # Figures
+    "COLUMN_IN",
+    "FIGURES",
+    "FIGURE_FORMATS",
+    "REPORT_DPI",
+    "REPORT_SIZE",
+    "SITE_COLOURS",
+    "EpisodePicture",
+    "FigureSize",
+    "figure",
+    "is_position",
+    "style",
+    "write_figure",
+    "write_figures",
+    "write_overlay",
+    # Reports, exports and viewers
+    "Conclusion",
+    "Exporter",
+    "ViewerOptions",
+    "conclude",
+    "conclude_files",
+    "list_export_formats",
+    "open_rerun",
+    "write_foxglove_layout",
+    "write_rviz_config",
+]
+
+if TYPE_CHECKING:
+    from . import style, terminal_output
+    from .appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize
+    from .certificate_text import describe_judgement
+    from .citation import compose_citation
+    from .conclusion import Conclusion, conclude, conclude_files
+    from .episode_picture import EpisodePicture, is_position
+    from .export import Exporter
+    from .exports import list_export_formats
+    from .figures.registry import FIGURES, figure, write_figures, write_overlay
+    from .rerun_viewer import ViewerOptions, open_rerun
+    from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
+    from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
+    from .summary_text import (
+        compose_benchmark,
+        compose_doctor,
+        compose_ping,
+        compose_topic_delays,
+    )
+    from .terminal_output import err, print_error, print_json, print_line, print_table
+    from .viewer_files import write_foxglove_layout, write_rviz_config
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "appearance": "COLUMN_IN FigureSize REPORT_SIZE SITE_COLOURS",
+            "certificate_text": "describe_judgement",
+            "citation": "compose_citation",
+            "conclusion": "Conclusion conclude conclude_files",
+            "episode_picture": "EpisodePicture is_position",
+            "export": "Exporter",
+            "exports": "list_export_formats",
+            "figures.registry": "FIGURES figure write_figures write_overlay",
+            "rerun_viewer": "ViewerOptions open_rerun",
+            "result_text": "Block MARKS MarkedText TextTable compose format_number",
+            "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
+            "summary_text": (
+                "compose_benchmark compose_doctor compose_ping compose_topic_delays"
+            ),
+            "terminal_output": (
+                "err print_error print_json print_line print_table terminal_output"
+            ),
+            "viewer_files": "write_foxglove_layout write_rviz_config",
+        },
+    )
 
 register_hooks(
     __name__,

@@ -67,22 +67,23 @@ class FigureSize(NamedTuple):
         """
         return self.width_in < 5.0
 
+    @classmethod
+    def for_print(cls, width_in: float) -> "FigureSize":
+        """Returns the size of a figure that fits a column or page of a paper, with 8 pt type.
+
+        Args:
+            width_in: Width in inches: 3.5 for one column, or 7 for two columns.
+
+        Raises:
+            UsageError: The width is neither of them.
+        """
+        if width_in not in (COLUMN_IN, PAGE_IN):
+            raise UsageError(
+                f"the width of a figure must be {COLUMN_IN:g} or {PAGE_IN:g} inches, "
+                f"not {width_in}"
+            )
+        return FigureSize(width_in=width_in, tick_pt=8.0, small_pt=8.0, dpi=600)
+
 
 REPORT_SIZE = FigureSize(width_in=PAGE_IN, tick_pt=7.0, small_pt=6.0, dpi=200)
 """Size of the figures beside the report."""
-
-
-def make_print_size(width_in: float) -> FigureSize:
-    """Returns the size of a figure that fits a column or the page of a paper, with 8 pt type.
-
-    Args:
-        width_in: Width in inches: 3.5 for one column, or 7 for two columns.
-
-    Raises:
-        UsageError: The width is neither of them.
-    """
-    if width_in not in (COLUMN_IN, PAGE_IN):
-        raise UsageError(
-            f"the width of a figure must be {COLUMN_IN:g} or {PAGE_IN:g} inches, not {width_in}"
-        )
-    return FigureSize(width_in=width_in, tick_pt=8.0, small_pt=8.0, dpi=600)

@@ -14,9 +14,7 @@ Invariant:
 
 from collections.abc import Iterator
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.metrics.log_metrics import LogMetrics
-from ..analysis.metrics.measures import Metric, Quantity, quantities
+from ..analysis import Certificate, LogMetrics, Metric, Quantity, quantities
 from ..errors import count_nouns
 from .certificate_text import (
     CertificateLine,

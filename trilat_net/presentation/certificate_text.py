@@ -19,16 +19,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.certificate import premise_quantities, verdict_facts
-from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
-from ..analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING, ObservedFinding
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.run_end import EndBehaviour, Stability
-from ..analysis.site_signals import SETTLED_ERROR_RAD
-from ..analysis.stability_decision import LoopRoots
-from ..analysis.twins.envelope_trend import EnvelopeTrend
-from ..analysis.twins.twin_growth import PushedTwins, TwinGrowth
-from ..core.step.vectors import Array
+from ..analysis import (
+    NEGATIVE_ENERGY_MEANING,
+    SETTLED_ERROR_RAD,
+    ZERO_ENERGY_J,
+    Certificate,
+    EndBehaviour,
+    EnergyBalance,
+    EnvelopeTrend,
+    LoopRoots,
+    ObservedFinding,
+    PushedTwins,
+    Stability,
+    TwinGrowth,
+    premise_quantities,
+    verdict_facts,
+)
+from ..core import Array
 from ..errors import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 

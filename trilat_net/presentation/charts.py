@@ -25,19 +25,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..analysis import site_signals
-from ..analysis.arm_rows import joint_positions_m
-from ..analysis.link_summary import measure_delay_distributions
-from ..analysis.timeline import (
+from ..analysis import (
     find_mode_intervals,
+    joint_positions_m,
     list_changes,
     list_stated_models,
+    measure_delay_distributions,
     recorded_end_s,
+    site_signals,
 )
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
+from ..core import Array
+from ..log import Ints, Log, SiteLog
 from . import plot_signals, style
 from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses

@@ -11,11 +11,10 @@ Invariant:
 
 from collections.abc import Iterator
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.run_end import Stability
+from ..analysis import Certificate, Stability
 from ..errors import count_nouns
 from ..files import find_version
-from ..log.log_reader import Log
+from ..log import Log
 
 _SOFTWARE = """@software{{trilat_net,
   title   = {{trilat-net}},

@@ -24,14 +24,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..analysis.timeline import recorded_end_s
-from ..core.step.vectors import Array
+from ..analysis import recorded_end_s
+from ..core import Array
 from ..errors import UnknownName, UsageError, suggest_nearest
-from ..log.data_tables import UNIT_SUFFIXES, Column
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD
-from ..scenario.arms import TASK_AXES
+from ..log import UNIT_SUFFIXES, Column, Ints, Log
+from ..log.ros2 import NUMBERS_BY_MODE_WORD
+from ..scenario import TASK_AXES
 from . import style
 from .appearance import REPORT_SIZE
 from .figures.registry import FIGURES

@@ -19,8 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..analysis.arm_rows import joint_positions_m
-from ..core.step.vectors import Array
+from ..analysis import joint_positions_m
+from ..core import Array
 from ..scenario import Scenario
 from . import style
 from .appearance import SITE_COLOURS

@@ -23,11 +23,7 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..files import import_extra, refuse_existing, stage_output
-from ..log.data_tables import Column, Table
-from ..log.log_layout import SCENARIO
-from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from ..log.provenance import collect_provenance
+from ..log import SCENARIO, Column, Log, Progress, Table, collect_provenance
 from ..results import JsonObject
 from . import exports
 

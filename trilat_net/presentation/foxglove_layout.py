@@ -23,9 +23,15 @@ that they do not know.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..log.ros2.cdr import FLOAT64_ARRAY, POSE, STRING
-from ..log.ros2.robot_model import SPACING_M, WORLD
-from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD, Ros2Channel, is_robot_description
+from ..log.ros2 import (
+    FLOAT64_ARRAY,
+    NUMBERS_BY_MODE_WORD,
+    POSE,
+    SPACING_M,
+    STRING,
+    WORLD,
+    Ros2Channel,
+)
 from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 
 _MODE = "mode"
@@ -258,7 +264,7 @@ def _add_arms(panels: _Panels, channels: Ros2Channels) -> str:
     topics: JsonObject = {}
     arm_count = 0
     for topic, channel in channels.items():
-        if is_robot_description(channel):
+        if channel.is_robot_description():
             arm_count += 1
             root, _, _ = topic.rpartition("/")
             site = root.rpartition("/")[2]

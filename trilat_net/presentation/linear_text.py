@@ -18,13 +18,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..analysis.theory.frequency_search import FrequencyBand
-from ..analysis.theory.linear_analysis import LinearAnalysis
-from ..analysis.theory.linear_edge import EdgeScan
-from ..analysis.theory.port_analysis import PortAnalysis, TwoPort
-from ..analysis.theory.port_passivity import Passivity
-from ..analysis.theory.port_response import QUOTED_AT_HZ, Transparency
-from ..core.step.vectors import Array
+from ..analysis import (
+    QUOTED_AT_HZ,
+    EdgeScan,
+    FrequencyBand,
+    LinearAnalysis,
+    Passivity,
+    PortAnalysis,
+    Transparency,
+    TwoPort,
+)
+from ..core import Array
 from ..errors import count_nouns
 from .result_text import Block, MarkedText, TextTable
 

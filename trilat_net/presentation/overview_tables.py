@@ -16,9 +16,9 @@ Invariant:
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from ..analysis.file_overview import FileOverview
+from ..analysis import FileOverview
 from ..errors import count_nouns
-from ..log.accounting import describe_unknown_ends
+from ..log import describe_unknown_ends
 from ..results import JsonObject
 from .result_text import Block, MarkedText, TextTable
 from .untrusted_text import sanitize

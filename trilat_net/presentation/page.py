@@ -31,11 +31,9 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.file_overview import summarise_run
+from ..analysis import Certificate, summarise_run
 from ..files import make_folder, write_whole
-from ..log.findings import Finding
-from ..log.log_reader import Log
+from ..log import Finding, Log
 from ..results import JsonObject
 from ..scenario import Scenario
 from .appearance import SITE_COLOURS

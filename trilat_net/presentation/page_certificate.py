@@ -14,9 +14,8 @@ import io
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.twins.twin_growth import PushedTwins
-from ..log.log_reader import Log
+from ..analysis import Certificate, PushedTwins
+from ..log import Log
 from .certificate_text import describe_certificate, list_energies
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.twin_differences import draw_twins

@@ -15,7 +15,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..log.log_reader import Log
+from ..log import Log
 from .charts import ChartBuilder
 from .figures.age_and_lateness import explain_missing_loop_times
 from .figures.arm_poses import render_arms_svg

@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..log.log_reader import Log
+from ..log import Log
 from .html_templates import render_macro
 
 NO_NUMBER = "–"

@@ -16,11 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis.dominance_history import list_ramps, trace_dominance
-from ..analysis.timeline import recorded_end_s
-from ..core.step.vectors import Array
+from ..analysis import list_ramps, recorded_end_s, trace_dominance
+from ..core import Array
 from ..errors import join_words
-from ..log.log_reader import Log
+from ..log import Log
 from ..scenario import Scenario
 from .html_templates import render_macro
 from .page_data import LeadBar

@@ -13,7 +13,7 @@ Invariant:
 from markupsafe import Markup
 
 from ..errors import count_nouns
-from ..log.log_reader import Log
+from ..log import Log
 from ..results import JsonObject
 from .html_templates import render_macro
 from .page_html import (

@@ -13,11 +13,9 @@ from pathlib import Path
 from markupsafe import Markup
 
 from ..errors import count_nouns
-from ..log.accounting import describe_unknown_ends
-from ..log.log_reader import Log
+from ..log import Log, describe_unknown_ends
 from ..results import JsonObject
-from ..scenario import Scenario, list_shipped, load_scenario
-from ..scenario.describe import compare_scenarios, list_arm_notes
+from ..scenario import Scenario, compare_scenarios, list_arm_notes, list_shipped, load_scenario
 from .html_templates import render_macro
 from .page_html import (
     render_code,

@@ -10,7 +10,7 @@ Invariant:
 from markupsafe import Markup
 
 from ..errors import count_nouns
-from ..log.log_reader import Log
+from ..log import Log
 from ..results import JsonObject
 from .figures.age_and_lateness import explain_missing_loop_times
 from .page_html import (

@@ -18,22 +18,21 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis.certificate.stability_certificate import Certificate
-from ..analysis.metrics.motion_metrics import measure_undelayed_error
-from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
-from ..analysis.run_view import RunView
-from ..analysis.site_signals import (
+from ..analysis import (
+    FORCE_NM,
     SETTLED_ERROR_RAD,
+    Certificate,
+    EndBehaviour,
     JointError,
-    find_error_of_last_second,
-    find_largest_error,
+    RunView,
+    Stability,
+    list_alarms,
+    measure_undelayed_error,
 )
-from ..analysis.timeline import list_alarms
 from ..errors import count_nouns, join_words
-from ..log.findings import Finding
-from ..log.log_reader import Log
+from ..log import Finding, Log
 from ..results import JsonObject
-from ..scenario.expect import END_WINDOW_S
+from ..scenario import END_WINDOW_S
 from .certificate_text import describe_pace, describe_settling
 from .html_templates import render_macro
 from .page_html import NO_NUMBER, format_cell, render_details
@@ -260,7 +259,7 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
     Returns:
         The first record with this error. None if no record has a finite error.
     """
-    peaks = [find_largest_error(log[site]) for site in sites or log.sites]
+    peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
     known = [peak for peak in peaks if peak is not None]
     return max(known, key=lambda peak: peak.value, default=None)
 
@@ -296,7 +295,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     unit = shared_unit(log)
     detail = f"largest, of {peak.joint}, at {peak.t_s:.2f} s"
 
-    last_errors = [find_error_of_last_second(log[site]) for site in sites]
+    last_errors = [JointError.find_in_last_second(log[site]) for site in sites]
     known = [error for error in last_errors if error is not None]
     last = max(known, key=lambda error: error.value, default=None)
     if last is not None:

@@ -16,15 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis.aligned import Bools
-from ..analysis.timeline import (
-    find_mode_intervals,
-    list_alarms,
-    recorded_end_s,
-)
-from ..core.step.vectors import Array
+from ..analysis import Bools, find_mode_intervals, list_alarms, recorded_end_s
+from ..core import Array
 from ..errors import count_nouns, join_words
-from ..log.log_reader import Log
+from ..log import Log
 from ..results import JsonObject
 from ..scenario import Scenario
 from .html_templates import render_macro

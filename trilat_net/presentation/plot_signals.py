@@ -14,10 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.step.vectors import Array
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
+from ..core import Array
+from ..log import Ints, Log, SiteLog
 
 
 def reference_angles(part: SiteLog) -> Array:

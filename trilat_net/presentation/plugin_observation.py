@@ -14,13 +14,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..analysis.arm_rows import build_arm_rows
-from ..core.step.vectors import Array
+from ..analysis import build_arm_rows
+from ..core import Array
 from ..errors import UsageError
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..scenario.arms import TASK_AXES
-from ..scenario.operators.kernel_operators import LiveHand
+from ..log import Ints, Log
+from ..scenario import TASK_AXES, LiveHand
 
 _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
 """Kind of exported actions that an operator of each mode accepts as commands."""

@@ -12,8 +12,7 @@ Invariant:
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ..analysis.certificate import premise_quantities
-from ..analysis.certificate.premises import find_missing_functionals
+from ..analysis import find_missing_functionals, premise_quantities
 from ..errors import count_nouns
 from ..scenario import Scenario
 

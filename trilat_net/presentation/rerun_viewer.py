@@ -28,19 +28,20 @@ from typing import Any, NamedTuple
 
 from ..errors import RunFailed, UsageError
 from ..files import import_extra
-from ..log.log_layout import ACTIVE_SUFFIX
-from ..log.log_reader import Log
-from ..log.ros2.cdr import JOINT_STATE, STRING, TRANSFORMS
-from ..log.ros2.robot_model import WORLD
-from ..log.ros2.ros2_messages import (
+from ..log import ACTIVE_SUFFIX, Log
+from ..log.ros2 import (
+    DIAGNOSTICS,
     EVENTS,
     FRAMES,
+    JOINT_STATE,
     LINES,
     SENT_PREFIX,
+    STRING,
+    TRANSFORMS,
+    WORLD,
     Ros2Channel,
     read_ros2_channels,
 )
-from ..log.ros2.topic_names import DIAGNOSTICS
 from .exports.ros2 import export_ros2
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]

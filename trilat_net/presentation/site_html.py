@@ -13,8 +13,8 @@ from collections.abc import Iterator
 
 from markupsafe import Markup
 
-from ..core.step.vectors import Array
-from ..log.site_log import SiteLog
+from ..core import Array
+from ..log import SiteLog
 from .html_templates import render_macro
 from .result_text import TextTable, format_number
 

@@ -35,14 +35,12 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
-from ..core.step.ticks import Mode
-from ..core.step.vectors import Array
+from ..analysis import find_mode_intervals, list_changes, recorded_end_s
+from ..core import Array
 from ..files import write_whole
-from ..log.log_reader import Log
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
-from ..scenario.arms import TASK_AXES
+from ..log import Ints, Log, SiteLog
+from ..records import Mode
+from ..scenario import TASK_AXES
 from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 from .plot_signals import decimate
 

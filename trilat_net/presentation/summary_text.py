@@ -24,20 +24,23 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..analysis import link_summary
-from ..analysis.metrics.log_metrics import LogMetrics
-from ..analysis.metrics.measured_impedance import FrequencyResponse
-from ..analysis.metrics.measures import Metric, Quantity, quantities
-from ..analysis.metrics.motion_metrics import measure_undelayed_error
-from ..analysis.run_view import RunView
-from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
+from ..analysis import (
+    FrequencyResponse,
+    LogMetrics,
+    Metric,
+    Quantity,
+    RunView,
+    StatedModel,
+    find_mode_intervals,
+    link_summary,
+    list_alarms,
+    list_changes,
+    measure_undelayed_error,
+    quantities,
+)
 from ..errors import count_nouns
-from ..execution.log_checks import LogCheckReport
-from ..execution.rerun import LinkEffect, Rerun, SiteEffect
-from ..execution.rerun_execution import describe_rerun_changes
-from ..log.log_reader import Log
-from ..log.recover import Recovery
-from ..log.session_check import LogCheckResult
+from ..execution import LinkEffect, LogCheckReport, Rerun, SiteEffect, describe_rerun_changes
+from ..log import Log, LogCheckResult, Recovery
 from ..results import Result
 from .plot_signals import shared_unit
 from .result_text import MARKS, Block, MarkedText, TextTable

@@ -29,7 +29,7 @@ from ..errors import count_nouns
 from .untrusted_text import CONTROLS, MAX_LETTERS, escape_controls, sanitize
 
 if TYPE_CHECKING:
-    from ..log.log_reader import Log
+    from ..log import Log
     from ..results import Result
     from .result_text import TextTable
 
@@ -318,7 +318,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
     Raises:
         LogError: A file is missing, is not an MCAP file, or is not a log of trilat-net.
     """
-    from ..log.log_reader import open_log
+    from ..log import open_log
 
     with progress_bar(f"reading {first}") as progress:
         log = open_log(first, *more, progress=progress, **allowed)
@@ -353,7 +353,7 @@ def warn_user_laws(log: "Log") -> None:
     Args:
         log: The log.
     """
-    from ..own_code.code_consent import find_user_laws
+    from ..own_code import find_user_laws
 
     for law in find_user_laws(log.scenario):
         if law.allowed:
@@ -374,8 +374,7 @@ def warn_if_unfinished(path: Path) -> None:
         LogError: The file cannot be read.
     """
     from ..files import reading
-    from ..log.mcap_records import RecordScanner
-    from ..log.recovery_survey import RecoverySurvey
+    from ..log import RecordScanner, RecoverySurvey
 
     with reading(path) as stream:
         scanner = RecordScanner(stream)

@@ -12,7 +12,7 @@ Invariant:
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..analysis.certificate import verdict_facts as facts
+from ..analysis import verdict_facts as facts
 from .premise_text import (
     describe_closed_groups,
     describe_missing_functionals,

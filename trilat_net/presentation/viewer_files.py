@@ -14,12 +14,16 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-from ..log.log_layout import VIZ_ROOT
-from ..log.log_reader import open_log
-from ..log.ros2.published import list_full_topics
-from ..log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
-from ..log.ros2.rviz_config import build_rviz_config
-from ..log.ros2.topic_names import NAMINGS, make_session_name, read_topic_table
+from ..log import VIZ_ROOT, open_log
+from ..log.ros2 import (
+    NAMINGS,
+    Ros2Channel,
+    TopicTable,
+    build_rviz_config,
+    list_full_topics,
+    make_session_name,
+    read_ros2_channels,
+)
 from .foxglove_layout import build_foxglove_layout
 from .rerun_viewer import build_plot_layout
 
@@ -105,5 +109,5 @@ def _list_session_topics(log: Path) -> dict[str, Ros2Channel]:
     """
     opened = open_log(log)
     session = make_session_name(opened.session["session"])
-    table = read_topic_table(NAMINGS[0])
+    table = TopicTable.read(NAMINGS[0])
     return list_full_topics(opened.scenario, session, table)

@@ -10,16 +10,222 @@ Invariant:
       scenario is loaded, with the path of the key and the nearest valid name.
 """
 
-from .expect import Expect as Expect
-from .override import apply_overrides as apply_overrides
-from .run_changes import find_owner as find_owner
-from .run_changes import parse_core_change as parse_core_change
-from .scenario_reader import embedded_names_reader as embedded_names_reader
-from .scenario_reader import find_site as find_site
-from .scenario_reader import list_shipped as list_shipped
-from .scenario_reader import load_scenario as load_scenario
-from .scenario_reader import parse_embedded as parse_embedded
-from .scenario_reader import parse_scenario as parse_scenario
-from .scenario_reader import read_template as read_template
-from .scenario_types import Scenario as Scenario
-from .scenario_types import SiteSpec as SiteSpec
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # Reading a scenario
+    "ExperimentText",
+    "SimulatedArm",
+    "TracePoint",
+    "apply_overrides",
+    "check_outside_arms",
+    "embedded_names_reader",
+    "find_site",
+    "import_trace",
+    "list_shipped",
+    "load_scenario",
+    "name_skeleton_class",
+    "new_hand",
+    "new_law",
+    "new_plant",
+    "parse_embedded",
+    "parse_scenario",
+    "read_source",
+    "read_template",
+    "refuse_external_arms",
+    "reseed_scenario",
+    "split_assignment",
+    "write_simulated_options",
+    # The parts of a scenario
+    "BUILT_IN",
+    "GRID_LOSSES_PERCENT",
+    "GRID_ROUND_TRIPS_MS",
+    "LAWS",
+    "TASK_AXES",
+    "ArmModel",
+    "Change",
+    "Limits",
+    "Scenario",
+    "SiteSpec",
+    "check_finite",
+    "field_names",
+    "identify_law",
+    "is_distribution",
+    "is_number",
+    "read_arm",
+    "scheduled_links",
+    # Links and delays
+    "ConstantDelay",
+    "LinkBase",
+    "LinkSchedule",
+    "NoDelay",
+    "PictureDelay",
+    "draw_used_samples",
+    "first_ticks",
+    # Operators and environments
+    "FAILED_HAND",
+    "POLICY",
+    "ActorBase",
+    "Chirp",
+    "DeviceSettings",
+    "HandPlayer",
+    "HandSite",
+    "JointSpring",
+    "LiveHand",
+    "Multisine",
+    "OwnPlant",
+    "PlantContext",
+    "PlantPlayer",
+    "ProgramHand",
+    "ViscousEnvironment",
+    "Wall",
+    "make_hand_players",
+    "make_hand_program",
+    "make_plant_players",
+    # Changes during a run
+    "LinkTables",
+    "describe_change",
+    "find_owner",
+    "find_requester",
+    "make_site_order",
+    "parse_core_change",
+    "resolve_change",
+    "to_core_change",
+    # Expectations
+    "ALL_SITES_QUANTITIES",
+    "END_WINDOW_S",
+    "Expect",
+    "ExpectWindow",
+    # Descriptions
+    "IRREVERSIBLE_SHARES",
+    "ScenarioDifference",
+    "compare_scenarios",
+    "describe_event",
+    "describe_law",
+    "describe_law_conditions",
+    "describe_scenario",
+    "describe_value",
+    "flatten_table",
+    "lacks_detailed_balance",
+    "list_arm_notes",
+    "list_law_situations",
+]
+
+if TYPE_CHECKING:
+    from .arms import TASK_AXES, ArmModel, read_arm
+    from .delay_models import LinkBase
+    from .delay_models.kernel_delays import ConstantDelay, NoDelay
+    from .delay_traces import TracePoint, import_trace
+    from .describe import (
+        IRREVERSIBLE_SHARES,
+        ScenarioDifference,
+        compare_scenarios,
+        describe_law,
+        describe_law_conditions,
+        describe_scenario,
+        describe_value,
+        flatten_table,
+        lacks_detailed_balance,
+        list_arm_notes,
+        list_law_situations,
+    )
+    from .event_text import describe_event
+    from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect, ExpectWindow
+    from .key_checks import check_finite, field_names, is_distribution, is_number
+    from .laws import BUILT_IN, LAWS, identify_law
+    from .operators import ActorBase
+    from .operators.kernel_operators import (
+        Chirp,
+        DeviceSettings,
+        JointSpring,
+        LiveHand,
+        Multisine,
+        ViscousEnvironment,
+        Wall,
+    )
+    from .operators.program_hand import (
+        FAILED_HAND,
+        POLICY,
+        HandPlayer,
+        HandSite,
+        ProgramHand,
+        make_hand_players,
+        make_hand_program,
+    )
+    from .override import apply_overrides, split_assignment
+    from .own_plant import OwnPlant
+    from .plant_player import PlantContext, PlantPlayer, make_plant_players
+    from .resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
+    from .run_changes import (
+        LinkTables,
+        describe_change,
+        find_owner,
+        find_requester,
+        make_site_order,
+        parse_core_change,
+        resolve_change,
+        to_core_change,
+    )
+    from .sample_uses import LinkSchedule, PictureDelay, draw_used_samples, first_ticks
+    from .scenario_reader import (
+        ExperimentText,
+        embedded_names_reader,
+        find_site,
+        list_shipped,
+        load_scenario,
+        parse_embedded,
+        parse_scenario,
+        read_source,
+        read_template,
+        reseed_scenario,
+    )
+    from .scenario_types import Change, Limits, Scenario, SiteSpec, scheduled_links
+    from .simulated_arm import SimulatedArm
+    from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
+    from .validate import check_outside_arms, refuse_external_arms, write_simulated_options
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "arms": "ArmModel TASK_AXES read_arm",
+            "delay_models": "LinkBase",
+            "delay_models.kernel_delays": "ConstantDelay NoDelay",
+            "delay_traces": "TracePoint import_trace",
+            "describe": (
+                "IRREVERSIBLE_SHARES ScenarioDifference compare_scenarios describe_law "
+                "describe_law_conditions describe_scenario describe_value flatten_table "
+                "lacks_detailed_balance list_arm_notes list_law_situations"
+            ),
+            "event_text": "describe_event",
+            "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect ExpectWindow",
+            "key_checks": "check_finite field_names is_distribution is_number",
+            "laws": "BUILT_IN LAWS identify_law",
+            "operators": "ActorBase",
+            "operators.kernel_operators": (
+                "Chirp DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
+            ),
+            "operators.program_hand": (
+                "FAILED_HAND HandPlayer HandSite POLICY ProgramHand make_hand_players "
+                "make_hand_program"
+            ),
+            "override": "apply_overrides split_assignment",
+            "own_plant": "OwnPlant",
+            "plant_player": "PlantContext PlantPlayer make_plant_players",
+            "resolve": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
+            "run_changes": (
+                "LinkTables describe_change find_owner find_requester make_site_order "
+                "parse_core_change resolve_change to_core_change"
+            ),
+            "sample_uses": "LinkSchedule PictureDelay draw_used_samples first_ticks",
+            "scenario_reader": (
+                "ExperimentText embedded_names_reader find_site list_shipped load_scenario "
+                "parse_embedded parse_scenario read_source read_template reseed_scenario"
+            ),
+            "scenario_types": "Change Limits Scenario SiteSpec scheduled_links",
+            "simulated_arm": "SimulatedArm",
+            "skeletons": "name_skeleton_class new_hand new_law new_plant",
+            "validate": "check_outside_arms refuse_external_arms write_simulated_options",
+        },
+    )

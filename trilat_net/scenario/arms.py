@@ -23,27 +23,36 @@ import msgspec
 import numpy as np
 
 from .. import fields
-from ..core.arms.chain import (
+from ..core import (
+    ArmLinks,
+    Array,
     ChainJoint,
+    ChainSetup,
+    Gains,
+    HandReach,
+    Law,
+    MotionLimits,
+    RestGains,
+    RowArray,
+    TaskSetup,
     Three,
+    Vector,
     apply,
     build_chain,
     mass_matrix,
     multiply,
     place_end_effector,
     place_joints,
+    relative_rotation,
+    rotation_matrix,
+    theta_from_links,
 )
-from ..core.arms.rotation import relative_rotation, rotation_matrix
-from ..core.arms.two_link_arm import ArmLinks, theta_from_links
-from ..core.life.live_hand import HandReach
-from ..core.step.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
-from ..core.step.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError, count_nouns
 from .key_checks import VectorCounts, field_names
 from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf
 
-TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
+TASK_AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task: three translations and three rotations."""
 STOP_REACH_RAD = 0.05
 """Depth in a stop at which the stop pushes with the effort limit of the joint, in rad or m."""

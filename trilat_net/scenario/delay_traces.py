@@ -35,9 +35,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.links.channel import LOST
-from ..core.links.delay import MAX_DELAY_US
-from ..core.step.vectors import Array, Points
+from ..core import LOST, MAX_DELAY_US, Array, Points
 from ..errors import ScenarioError, UsageError, count_nouns
 from ..files import open_regular
 from ..hooks import find_hook

@@ -20,14 +20,16 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ..core.arms.chain import ChainJoint
-from ..core.links.delay import DelayKind
-from ..core.links.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
-from ..core.links.philox import link_key
-from ..core.step.vectors import Array
+from ..core import (
+    ROW_SUM_TOLERANCE,
+    Array,
+    ChainJoint,
+    DelayKind,
+    find_balancing_weights,
+    link_key,
+)
 from ..errors import count_nouns
-from ..laws.conditions import ArmLoad, LawSituation, StabilityCondition
-from ..laws.interface import LawSettings
+from ..laws import ArmLoad, LawSettings, LawSituation, StabilityCondition
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
 from .operators.kernel_operators import (

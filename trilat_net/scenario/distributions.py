@@ -20,10 +20,10 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from ..core.arms.chain import MAX_JOINTS
-from ..core.links.philox import link_key
+from ..core import link_key
 from ..errors import ScenarioError
 from ..fields import Frozen, NotNegative, Real, TomlTable
+from ..records import MAX_JOINTS
 from .key_checks import is_distribution, is_number
 
 _MAX_LIST_LENGTH = 64

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from ..core.arms.chain import MAX_JOINTS
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, TomlTable
+from ..records import MAX_JOINTS
 from .key_checks import check_keys, field_names
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, TypeGuard, get_type_hints
 import msgspec
 from msgspec import Meta
 
-from ..core.arms.chain import LINK_PARAMETERS
-from ..core.arms.two_link_arm import JOINTS, PARAMETERS
+from ..core import LINK_PARAMETERS
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import WITHOUT_QUOTES, KeyProblem, TomlTable
+from ..records import JOINTS, PARAMETERS
 
 StructType = type[msgspec.Struct]
 

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Union
 
-from ..laws.interface import ControlLaw, LawSettings, format_class_name
-from ..own_code.imported_code import ImportedLaw
+from ..laws import ControlLaw, LawSettings, format_class_name
+from ..own_code import ImportedLaw
 
 _LAWS_PACKAGE = "trilat_net.laws"
 

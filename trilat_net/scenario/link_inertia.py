@@ -20,7 +20,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from .. import fields
-from ..core.arms.chain import Matrix
+from ..core import Matrix
 from .key_checks import field_names
 
 JACOBI_SWEEPS = 12

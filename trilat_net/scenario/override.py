@@ -18,7 +18,7 @@ from typing import Any
 
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import TomlTable
-from ..own_code.imported_code import ImportedLaw, name_law_classes
+from ..own_code import ImportedLaw, name_law_classes
 from .delay_models import DELAY_MODELS
 from .key_checks import check_keys, field_names, hint_at_quotes
 from .laws import LAWS

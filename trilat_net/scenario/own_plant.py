@@ -16,7 +16,7 @@ from msgspec import Meta, field
 
 from ..errors import ScenarioError
 from ..fields import Frozen
-from ..own_code.imported_code import CLASS_PATTERN, read_code
+from ..own_code import CLASS_PATTERN, read_code
 from .key_checks import is_number
 
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.step.vectors import Array
+from ..core import Array
 from ..errors import count_nouns
 
 _SEQUENCE_NUMBERS = 2**16

@@ -16,11 +16,9 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from ..core.step.ticks import PlantState
-from ..core.step.vectors import Array
+from ..core import Array, PlantState
 from ..errors import PlantFailed, ScenarioError, count_nouns, describe_exception
-from ..own_code.class_arguments import make_own_instance
-from ..own_code.imported_code import CodeKey, Watch, call_directly, import_class
+from ..own_code import CodeKey, Watch, call_directly, import_class, make_own_instance
 from .own_plant import OwnPlant
 from .scenario_types import Scenario
 

@@ -32,13 +32,11 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 import numpy as np
 
-from ..core.arms.two_link_arm import ArmLinks
-from ..core.links import dominance
+from ..core import ROW_SUM_TOLERANCE, ArmLinks, Array
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import Frozen, TomlTable, reword_problem, split_refusal
 from ..files import open_regular
-from ..own_code.imported_code import CLASS_PATTERN, read_code
-from ..own_code.sent_channel import parse_classes, read_sends
+from ..own_code import CLASS_PATTERN, parse_classes, read_code, read_sends
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
@@ -893,6 +891,30 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
             )
 
 
+def find_row_problem(row: Array, site: int) -> str | None:
+    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
+
+    The row contains the weights with which one site follows the others. They must lie between 0
+    and 1 and sum to 1, and the site must not follow itself.
+
+    Args:
+        row: Dominance factors of one site, shape (N,).
+        site: Index of that site.
+
+    Returns:
+        A clause for an error message. None if the row is valid.
+    """
+    if not np.isfinite(row).all():
+        return "shares must be finite numbers"
+    if row[site] != 0.0:
+        return f"a site does not follow itself, yet its own share is {row[site]:g}"
+    if (row < 0.0).any() or (row > 1.0).any():
+        return "shares must lie between 0 and 1"
+    if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
+        return f"shares must sum to 1, Eq. (7), and sum to {row.sum():.12g}"
+    return None
+
+
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
     """Returns the dominance factors of a site: the weights with which it follows its peers.
 
@@ -915,7 +937,7 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 
     factors = {name: float(row.get(name, 0.0)) for name in names}
     row_vector = np.array(list(factors.values()))
-    problem = dominance.find_row_problem(row_vector, names.index(site))
+    problem = find_row_problem(row_vector, names.index(site))
     if problem:
         raise ScenarioError(problem, path=path)
     del factors[site]

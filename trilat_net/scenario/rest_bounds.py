@@ -20,11 +20,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arms.chain import build_chain, inverse_dynamics, place_joints, propagate_motion
-from ..core.arms.two_link_arm import theta_from_links
-from ..core.life.resting import REST_RATE_1_S
-from ..core.step.site_setup import Law, SiteSetup
-from ..core.step.vectors import Array
+from ..core import (
+    REST_RATE_1_S,
+    Array,
+    Law,
+    SiteSetup,
+    build_chain,
+    inverse_dynamics,
+    place_joints,
+    propagate_motion,
+    theta_from_links,
+)
 from .arms import Arm, ArmModel
 from .scenario_types import Scenario
 

@@ -22,8 +22,9 @@ from typing import Any
 
 import msgspec
 
-from ..core.step.ticks import NS_PER_S, CoreChange, LifeOrder
+from ..core import CoreChange, LifeOrder
 from ..errors import ScenarioError
+from ..records import NS_PER_S
 from .delay_models import LinkBase
 from .resolve import resolve_dominance_row, resolve_target
 from .scenario_types import Change, Scenario, SiteOrder

@@ -16,13 +16,18 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..core.links.channel import LOST, schedule_deliveries
-from ..core.links.delay import LINK_MODEL_DTYPE, LinkModel
-from ..core.links.link import link_dtype
-from ..core.links.philox import link_key
-from ..core.step.site_setup import LinkSetup
-from ..core.step.ticks import NS_PER_S
-from ..core.step.vectors import IntArray, Row
+from ..core import (
+    LINK_MODEL_DTYPE,
+    LOST,
+    IntArray,
+    LinkModel,
+    LinkSetup,
+    Row,
+    link_dtype,
+    link_key,
+    schedule_deliveries,
+)
+from ..records import NS_PER_S
 from .delay_models import LinkBase
 from .scenario_types import Scenario
 

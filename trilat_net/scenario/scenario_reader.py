@@ -21,8 +21,7 @@ import tomli_w
 
 from ..errors import ScenarioError, suggest_nearest
 from ..files import open_regular
-from ..own_code.code_consent import allow_own_code
-from ..own_code.imported_code import name_law_classes
+from ..own_code import allow_own_code, name_law_classes
 from .override import (
     Override,
     apply_overrides,
@@ -122,7 +121,7 @@ def load_scenario(
     pairs = _join_overrides(overrides, duration_s, seed)
     if isinstance(source, Scenario):
         return _change_scenario(source, pairs)
-    experiment = read_experiment(source)
+    experiment = ExperimentText.read(source)
     is_text = isinstance(source, Mapping) or "\n" in str(source)
     label = "scenario" if is_text else experiment.label
     return allow_own_code(parse_scenario(experiment.text, label, pairs, experiment.folder))
@@ -202,30 +201,31 @@ class ExperimentText(NamedTuple):
             return load_scenario(parse_scenario(self.text, self.label, folder=None), overrides)
         return allow_own_code(parse_scenario(self.text, self.label, overrides, self.folder))
 
+    @classmethod
+    def read(cls, source: str | Path | Mapping[str, Any] | Scenario) -> "ExperimentText":
+        """Reads the description of an experiment as its author wrote it, without checking it.
 
-def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:
-    """Reads the description of an experiment as its author wrote it, without checking it.
+        Args:
+            source: One of the following: the name of a scenario in the package, the path of a
+                file, a TOML text, nested dictionaries of settings, or a `Scenario`.
 
-    Args:
-        source: One of the following: the name of a scenario in the package, the path of a file,
-            a TOML text, nested dictionaries of settings, or a `Scenario`.
+        Returns:
+            The description as a TOML text, with a name and the folder of the files that it
+            names.
 
-    Returns:
-        The description as a TOML text, with a name and the folder of the files that it names.
-
-    Raises:
-        ScenarioError: The source cannot be read.
-    """
-    if isinstance(source, Scenario):
-        return ExperimentText(f"./{source.name}.toml", source.text, None)
-    if isinstance(source, Mapping):
-        name = str(source.get("name", "scenario"))
-        text = tomli_w.dumps(name_law_classes(source))
-        return ExperimentText(f"./{name}.toml", text, Path())
-    if isinstance(source, str) and "\n" in source:
-        return ExperimentText("./scenario.toml", source, Path())
-    text, folder = read_source(source)
-    return ExperimentText(str(source), text, folder)
+        Raises:
+            ScenarioError: The source cannot be read.
+        """
+        if isinstance(source, Scenario):
+            return ExperimentText(f"./{source.name}.toml", source.text, None)
+        if isinstance(source, Mapping):
+            name = str(source.get("name", "scenario"))
+            text = tomli_w.dumps(name_law_classes(source))
+            return ExperimentText(f"./{name}.toml", text, Path())
+        if isinstance(source, str) and "\n" in source:
+            return ExperimentText("./scenario.toml", source, Path())
+        text, folder = read_source(source)
+        return ExperimentText(str(source), text, folder)
 
 
 def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:

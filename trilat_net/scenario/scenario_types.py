@@ -27,21 +27,30 @@ import numpy as np
 import tomli_w
 from msgspec import Meta
 
-from ..core.arms.chain import MAX_JOINTS
-from ..core.arms.two_link_arm import ArmLinks
-from ..core.links import dominance
-from ..core.links.philox import link_key
-from ..core.plug.law_channel import LawChannel
-from ..core.step import site_setup
-from ..core.step.ticks import DominanceRamp
-from ..core.step.vectors import Array
+from ..core import (
+    ArmLinks,
+    Array,
+    DominanceRamp,
+    Gains,
+    LawChannel,
+    LinkSetup,
+    MotionLimits,
+    RestGains,
+    Scheme,
+    SiteSetup,
+    StaleAction,
+    StaleRule,
+    dominance,
+    link_key,
+    make_layout,
+)
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
-from ..laws.sent_vectors import SentVectorSpecs
-from ..own_code.sent_channel import build_channel
+from ..laws import SentVectorSpecs
+from ..own_code import build_channel
 from ..recorded_change import RecordedChange
 from ..recorded_change import SiteOrder as SiteOrder
-from ..records import Layout
+from ..records import MAX_JOINTS, Layout
 from .arms import (
     START_MARGIN_RAD,
     Arm,
@@ -96,22 +105,22 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     on_lost: Literal["hold", "degrade"] = "hold"
 
     @property
-    def rule(self) -> site_setup.StaleRule:
+    def rule(self) -> StaleRule:
         """Reaction to missing messages of another site, as a record for the control loop.
 
         The scenario states times in ms, and the record in whole ns, because the kernel computes
         with integers.
         """
         if self.action == "glide":
-            return site_setup.StaleRule(
-                action=site_setup.StaleAction.GLIDE,
+            return StaleRule(
+                action=StaleAction.GLIDE,
                 age_ns=round(self.silence_ms * 1e6),
                 align_speed=self.align_speed_rad_s,
                 align_limit=self.align_limit_rad,
                 degrades=self.on_lost == "degrade",
             )
-        return site_setup.StaleRule(
-            action=site_setup.StaleAction[self.action.upper()],
+        return StaleRule(
+            action=StaleAction[self.action.upper()],
             age_ns=round(self.age_ms * 1e6),
             return_ns=round(self.return_s * 1e9),
         )
@@ -163,13 +172,13 @@ class Limits(Frozen, frozen=True):
     q_max_rad: Real | Joints | None = None
 
     @property
-    def motion(self) -> site_setup.MotionLimits:
+    def motion(self) -> MotionLimits:
         """Limits of joint angles, reference speed and torque rate, as a record for the kernel.
 
         A limit that the author of the scenario left out is infinite, so that the kernel needs
         no special case.
         """
-        return site_setup.MotionLimits(
+        return MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
             q_max=_or_infinity(self.q_max_rad),
             qd_des_limit=_or_infinity(self.qd_des_limit_rad_s),
@@ -648,7 +657,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
         """
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
-        layout = site_setup.make_layout(self.arms[site].chain)
+        layout = make_layout(self.arms[site].chain)
         return build_channel(sends, layout, len(self.names) - 1)
 
     def layout(self, site: str) -> Layout:
@@ -662,9 +671,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         live_hand = self.sites[site].find_live_hand()
         actors = () if live_hand is None else (live_hand.actor,)
-        layout = site_setup.make_layout(
-            self.arms[site].chain, self.channel(site).record_size, actors
-        )
+        layout = make_layout(self.arms[site].chain, self.channel(site).record_size, actors)
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
@@ -683,7 +690,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         plant = self.sites[site].plant
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
-    def setup(self, site: str) -> site_setup.SiteSetup:
+    def setup(self, site: str) -> SiteSetup:
         """Returns all settings from which the compiled control loop of a site is built.
 
         A site is the process that runs one arm. The result contains its arm, control law,
@@ -696,13 +703,13 @@ class Scenario(Frozen, frozen=True, dict=True):
         arm = self.arms[site]
         index = self.names.index(site)
         control = self.controls[index]
-        rest_gains = site_setup.RestGains()
+        rest_gains = RestGains()
         if spec.on_stale.action == "glide":
             rest_gains = self._rest_gains(site)
-        return site_setup.SiteSetup(
+        return SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
-            scheme=site_setup.Scheme[self.scheme.upper()],
+            scheme=Scheme[self.scheme.upper()],
             gains=self.gains(site),
             theta=arm.theta,
             g_m_s2=spec.arm.g_m_s2,
@@ -726,7 +733,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             bit=1 << index,
         )
 
-    def motion_limits(self, site: str) -> site_setup.MotionLimits:
+    def motion_limits(self, site: str) -> MotionLimits:
         """Returns the limits of a site's motion during a run.
 
         A joint may start a little beyond `q_min_rad` or `q_max_rad`, up to a margin. For such a
@@ -754,7 +761,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             q_max=tuple(np.where(starts_above, high + margin, high).tolist()),
         )
 
-    def gains(self, site: str) -> site_setup.Gains:
+    def gains(self, site: str) -> Gains:
         """Returns the gains of a site's control law, as the record that the control loop reads.
 
         A site is the process that runs one arm. If the law is adaptive, it estimates the
@@ -771,7 +778,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             return gains
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
-    def _rest_gains(self, site: str) -> site_setup.RestGains:
+    def _rest_gains(self, site: str) -> RestGains:
         """Returns the gains of the controller that brings a site's arm to rest.
 
         It acts, for example, when a peer is silent. The gains depend on the arm, on the limit
@@ -791,7 +798,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             known=spec.arm.known,
         )
 
-    def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
+    def _link_setup(self, peer: str, site: str) -> LinkSetup:
         """Returns the link from a peer to a site as the record that the kernel reads.
 
         It includes the planned changes of the link.
@@ -808,7 +815,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         speed_limit: tuple[float, ...] = ()
         if self.sites[site].on_stale.action == "glide":
             speed_limit = self._speed_limit(peer)
-        return site_setup.LinkSetup(
+        return LinkSetup(
             peer=peer,
             alpha=self.dominance[site].get(peer, 0.0),
             rate_hz=self.sites[peer].rate_hz,

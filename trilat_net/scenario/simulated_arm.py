@@ -11,10 +11,11 @@ Invariant:
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arms.chain import MAX_JOINTS, build_chain, find_acceleration, place_joints
-from ..core.step.vectors import Array
-from . import Scenario, find_site
+from ..core import Array, build_chain, find_acceleration, place_joints
+from ..records import MAX_JOINTS
 from .arms import build_arm
+from .scenario_reader import find_site
+from .scenario_types import Scenario
 
 
 class SimulatedArm:

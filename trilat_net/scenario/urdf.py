@@ -28,10 +28,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ..core.arms.chain import MAX_JOINTS, Matrix, Three, apply, multiply
-from ..core.arms.elementary import sincos
+from ..core import Matrix, Three, apply, multiply, sincos
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import MAX_QUANTITY
+from ..records import MAX_JOINTS
 from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 
 MAX_CHARACTERS = 1_000_000

@@ -21,14 +21,12 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from ..core.links.dominance import is_irreducible
-from ..core.step.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
+from ..core import MAX_LINKS_BYTES, is_irreducible, links_bytes, needed_pages
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
-from ..laws.interface import LawSettings
-from ..own_code.imported_code import ImportedLaw
-from ..own_code.sent_channel import check_sends
+from ..laws import LawSettings
+from ..own_code import ImportedLaw, check_sends
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .delay_models import LinkBase
@@ -149,31 +147,6 @@ def check_outside_arms(scenario: Scenario) -> None:
                 path=f"sites.{name}.on_stale.action",
                 source=scenario.name,
             )
-
-
-def refuse_live_only(scenario: Scenario) -> None:
-    """Refuses a scenario that only a live session can run.
-
-    A live session has a real network, and may have real robots.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Raises:
-        ScenarioError: An arm is external, or a link has the model "measured": it injects no
-            delay: the real network decides. In virtual time there is no real network.
-    """
-    refuse_external_arms(scenario)
-    if scenario.measured:
-        measured_links = [name for name, link in scenario.links.items() if link.measured]
-        path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
-        raise ScenarioError(
-            "is 'measured', the delay of a real network: a scenario with such a link can only "
-            "run live; to run the scenario here, set another model, as in link.model=constant "
-            "and link.delay_ms=50",
-            path=path,
-            source=scenario.name,
-        )
 
 
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:

@@ -1,1 +1,51 @@
 """Work in many runs: processes that share it, folders that keep it, and intervals."""
+
+from typing import TYPE_CHECKING
+
+from ..hooks import import_on_use
+
+__all__ = [
+    # Worker processes
+    "MAX_LOSSES",
+    "Progress",
+    "WorkerPool",
+    "Workers",
+    "check_workers",
+    "count_workers",
+    "ignore_progress",
+    "open_worker_pool",
+    # Folders of studies
+    "RunJournal",
+    "StudyFolder",
+    "build_resume_hint",
+    "encode_csv",
+    # Intervals of confidence
+    "MeanInterval",
+    "wilson_interval",
+]
+
+if TYPE_CHECKING:
+    from .executor import (
+        MAX_LOSSES,
+        Progress,
+        WorkerPool,
+        Workers,
+        check_workers,
+        count_workers,
+        ignore_progress,
+        open_worker_pool,
+    )
+    from .intervals import MeanInterval, wilson_interval
+    from .study_folder import RunJournal, StudyFolder, build_resume_hint, encode_csv
+else:
+    __getattr__ = import_on_use(
+        __name__,
+        {
+            "executor": (
+                "MAX_LOSSES Progress WorkerPool Workers check_workers count_workers "
+                "ignore_progress open_worker_pool"
+            ),
+            "intervals": "MeanInterval wilson_interval",
+            "study_folder": "RunJournal StudyFolder build_resume_hint encode_csv",
+        },
+    )

@@ -23,13 +23,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..core.step.fingerprint import compute_fingerprint
+from ..core import compute_fingerprint
 from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
-from ..log.provenance import collect_provenance
-from ..net.clock import SystemClock
-from ..net.host_names import UnknownHost, check_hosts
-from ..own_code.imported_code import NamedCode, read_code
+from ..log import collect_provenance
+from ..net import SystemClock, UnknownHost, check_hosts
+from ..own_code import NamedCode, read_code
 from ..package_names import PACKAGE_COMMANDS
 
 CONNECT_S = 10.0

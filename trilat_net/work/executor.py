@@ -31,8 +31,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from ..errors import RunFailed, UsageError
 from ..files import require_libraries
-from ..net.clock import SystemClock
-from ..own_code.imported_code import CodeConsents, allowed_code, allowing_any_settings
+from ..net import SystemClock
+from ..own_code import CodeConsents, allowed_code, allowing_any_settings
 from ..workers import count_cores, worker_pool
 from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
 

@@ -51,25 +51,25 @@ class MeanInterval(NamedTuple):
     def __str__(self) -> str:
         return f"{self.mean:.4g} +- {self.half:.2g}"
 
+    @classmethod
+    def of_values(cls, values: Sequence[float | None]) -> "MeanInterval | None":
+        """Returns the mean of the numbers of several runs, with its 95 % interval.
 
-def mean_interval(values: Sequence[float | None]) -> MeanInterval | None:
-    """Returns the mean of the numbers of several runs, with its 95 % interval.
+        Args:
+            values: One number per run. None stands for a run without a number.
 
-    Args:
-        values: One number per run. None stands for a run without a number.
+        Returns:
+            The mean. None if there are fewer than two numbers, or if a number is missing.
+        """
+        known = [value for value in values if value is not None]
+        count = len(known)
+        if count < 2 or count < len(values):
+            return None
+        # Imported here, because the import takes long.
+        from scipy.special import stdtrit
 
-    Returns:
-        The mean. None if there are fewer than two numbers, or if a number is missing.
-    """
-    known = [value for value in values if value is not None]
-    count = len(known)
-    if count < 2 or count < len(values):
-        return None
-    # Imported here, because the import takes long.
-    from scipy.special import stdtrit
-
-    deviation = np.std(known, ddof=1)
-    standard_error = float(deviation / np.sqrt(count))
-    quantile = float(stdtrit(count - 1, 0.975))
-    mean = float(np.mean(known))
-    return MeanInterval(mean, half=quantile * standard_error)
+        deviation = np.std(known, ddof=1)
+        standard_error = float(deviation / np.sqrt(count))
+        quantile = float(stdtrit(count - 1, 0.975))
+        mean = float(np.mean(known))
+        return MeanInterval(mean, half=quantile * standard_error)

@@ -22,102 +22,30 @@ from pathlib import Path
 from typing import Any, BinaryIO, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
-import tomli_w
 
-from ..core.step.fingerprint import compute_fingerprint
-from ..errors import LogRefused, ScenarioError, count_nouns, join_arguments
-from ..files import describe_write_error, extend_file
-from ..log.provenance import collect_provenance
-from ..own_code.imported_code import name_law_classes
-from ..scenario.key_checks import is_distribution
+from ..errors import LogRefused, count_nouns, join_arguments
+from ..files import describe_write_error, refuse_link
 from .executor import Progress, Together, WorkerPool
 
 
-def format_command(*arguments: str) -> str:
-    """Returns a command that a user can paste into a shell: "trilat sim 'my run.toml'".
-
-    Arguments with spaces or special characters are quoted. The word "trilat" is put first.
-    """
-    return join_arguments(["trilat", *arguments])
-
-
-def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns the command-line options --set that apply overrides of a scenario.
+def extend_file(path: Path) -> BinaryIO:
+    """Opens a file for appending without a buffer, and creates it if it does not exist.
 
     Args:
-        overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
-
-    Returns:
-        The arguments "--set" and KEY=VALUE, in turn.
-    """
-    arguments = []
-    for text in overrides:
-        arguments += ["--set", text]
-    return arguments
-
-
-def format_toml_value(value: Any) -> str:
-    """Returns a value as TOML on one line, for commands and overrides.
-
-    A number is written as short as possible, if it still parses back to the same number.
-
-    Args:
-        value: A number, text, list or table.
+        path: Path of the file.
 
     Raises:
-        ScenarioError: TOML cannot express the value.
+        UsageError: The path is a symbolic link.
+        OSError: The file cannot be opened.
     """
-    value = name_law_classes(value)
-    if isinstance(value, Mapping):
-        entries = []
-        for key, entry in value.items():
-            entry_text = format_toml_value(entry)
-            entries.append(f"{key} = {entry_text}")
-        return f"{{{', '.join(entries)}}}"
-    if isinstance(value, list | tuple):
-        items = map(format_toml_value, value)
-        return f"[{', '.join(items)}]"
-    if isinstance(value, float) and float(f"{value:g}") == value:
-        return f"{value:g}"
-    try:
-        assignment = tomli_w.dumps({"v": value})
-        return assignment.removeprefix("v = ").removesuffix("\n")
-    except TypeError:
-        raise ScenarioError(
-            f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
-        ) from None
+    refuse_link(path)
+    # A link that appears after the check is refused by this flag, which Windows lacks.
+    no_follow = getattr(os, "O_NOFOLLOW", 0)
 
+    def open_without_following(name: str, flags: int) -> int:
+        return os.open(name, flags | no_follow, 0o666)
 
-def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the overrides of a nested mapping as texts KEY=VALUE, as on the command line.
-
-    Args:
-        overrides: Values by key, also as nested tables.
-        prefix: Keys of the enclosing tables, each followed by a dot.
-    """
-    for key, value in overrides.items():
-        if isinstance(value, Mapping) and not is_distribution(value):
-            yield from list_assignments(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}={format_toml_value(value)}"
-
-
-# Packages that compute the results, by their keys in the provenance of a log.
-_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
-
-
-def describe_program() -> tuple[str, dict[str, str]]:
-    """Returns the properties of this program and machine on which numerical results depend.
-
-    Results of a study are mixed only if these properties are the same.
-
-    Returns:
-        A fingerprint of how the machine rounds floating point numbers; and the versions of the
-        program and of the packages that compute the results.
-    """
-    provenance = collect_provenance()
-    versions = {name: provenance[name] for name in _VERSIONS}
-    return compute_fingerprint(), versions
+    return open(path, "ab", buffering=0, opener=open_without_following)
 
 
 def build_resume_hint(*arguments: str) -> str:
@@ -126,7 +54,7 @@ def build_resume_hint(*arguments: str) -> str:
     Args:
         arguments: Arguments of the command that continues the study.
     """
-    command = format_command(*arguments)
+    command = join_arguments(["trilat", *arguments])
     return f"finished runs are kept: make room, and continue with: {command}"
 
 

@@ -26,12 +26,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from trilat_net.app.input_device import Device, DeviceState, Vector
-from trilat_net.core.life.live_hand import GRIP_NS, SILENCE_NS, HandReach
+from trilat_net.app import Device, DeviceState, Vector
+from trilat_net.core import GRIP_NS, SILENCE_NS, HandReach
 from trilat_net.errors import count_nouns
-from trilat_net.net.arm_client import Hand
-from trilat_net.net.clock import Clock
-from trilat_net.scenario.operators.kernel_operators import DeviceSettings
+from trilat_net.net import Clock, Hand
+from trilat_net.scenario import DeviceSettings
 
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""

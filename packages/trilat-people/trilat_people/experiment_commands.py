@@ -9,9 +9,7 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import flag, value
-from trilat_net.app.cli.run_progress import show_progress
+from trilat_net.app import flag, options, show_progress, value
 from trilat_net.errors import count_nouns
 from trilat_net.presentation import terminal_output as terminal
 

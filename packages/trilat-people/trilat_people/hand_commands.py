@@ -4,8 +4,7 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import seconds, value
+from trilat_net.app import options, seconds, value
 from trilat_net.errors import UsageError
 from trilat_net.presentation import terminal_output as terminal
 from trilat_net.signals import Interrupt
@@ -63,9 +62,8 @@ def hand_command(
         raise UsageError(
             "a class of your own needs --scenario; a device that you hold needs --device"
         )
-    from sites.hand_process import run_hand
-    from trilat_net.net.connection import default_endpoints
-    from trilat_net.net.zenoh_config import OPERATOR
+    from sites import run_hand
+    from trilat_net.net import OPERATOR, default_endpoints
     from trilat_net.scenario import find_site
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -103,7 +101,7 @@ def _lead_by_device(
         reach: The options by which the command reaches the session.
         timeout_s: Longest wait for the site, in s.
     """
-    from trilat_net.app.running_session import RunningSession
+    from trilat_net.app import RunningSession
 
     from .devices import open_device
 

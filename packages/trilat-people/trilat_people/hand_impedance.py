@@ -40,17 +40,19 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from trilat_net.analysis.aligned import AlignedRecords, align_records
-from trilat_net.analysis.theory.characteristic_roots import Complex
-from trilat_net.analysis.torque_sources import compute_operator_script, split_torque
-from trilat_net.core.arms.exogenous import SCRIPTED_KINDS
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import (
+    AlignedRecords,
+    Complex,
+    TorqueSplit,
+    align_records,
+    compute_operator_script,
+)
+from trilat_net.core import SCRIPTED_KINDS, Array
 from trilat_net.errors import UsageError, count_nouns
-from trilat_net.log.log_reader import Log, open_log
-from trilat_net.presentation.result_text import Block, TextTable
+from trilat_net.log import Log, open_log
+from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import Scenario, find_site
-from trilat_net.scenario.operators.kernel_operators import Multisine
+from trilat_net.scenario import Multisine, Scenario, find_site
 
 MIN_SEGMENTS = 5
 """Smallest number of segments for confidence intervals."""
@@ -377,7 +379,7 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
     Returns:
         The force in N and the position in m, shape (K, n) each for K records.
     """
-    split = split_torque(records, scenario)
+    split = TorqueSplit.of_records(records, scenario)
     end_effector = split.end_effector
     scripted_torque = np.zeros_like(records.q)
     for hand in scenario.sites[records.site].hands:

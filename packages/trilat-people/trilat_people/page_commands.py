@@ -9,11 +9,9 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import value
-from trilat_net.app.cli.sessions import run_and_report
+from trilat_net.app import options, run_and_report, value
 from trilat_net.errors import UsageError
-from trilat_net.net.clock import SystemClock
+from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
 
 from .page_options import PageServing

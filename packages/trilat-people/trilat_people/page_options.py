@@ -5,7 +5,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from trilat_net.app.cli.options import flag, value
+from trilat_net.app import flag, value
 
 
 class PageServing(NamedTuple):

@@ -27,36 +27,47 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
-from trilat_net.app.running_session import RunningSession, open_hand
-from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.app import RunningSession, open_hand
 from trilat_net.errors import TrilatError, UsageError, count_nouns
 from trilat_net.files import refuse_existing, write_whole
-from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.published import (
+from trilat_net.log.ros2 import (
     COMMON_TOPICS,
+    DIAGNOSTICS,
+    FRAMES_TOPIC,
+    SESSION_CHANNELS,
+    RobotTable,
+    Ros2SiteChannels,
+    TopicTable,
+    build_rviz_config,
+    cdr,
     list_full_topics,
+    pack_event,
     pack_session_diagnostics,
 )
-from trilat_net.log.ros2.ros2_messages import SESSION_CHANNELS, Ros2SiteChannels, pack_event
-from trilat_net.log.ros2.rviz_config import build_rviz_config
-from trilat_net.log.ros2.topic_names import DIAGNOSTICS, FRAMES, RobotTable, TopicTable
-from trilat_net.net import topics
-from trilat_net.net.arm_client import ArmClient, Hand
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection
-from trilat_net.net.discovery import find_members, list_past_events
-from trilat_net.net.membership import read_messages, read_records
-from trilat_net.net.messages import Event, Info, LinkStats
-from trilat_net.net.ros2_graph import (
+from trilat_net.net import (
+    BRIDGE,
     ROUTER_ADVICE,
+    ArmClient,
     Attachment,
+    Clock,
+    Connection,
+    Event,
+    Hand,
+    Info,
+    LinkStats,
     Refusals,
     Ros2Graph,
+    RouterSilent,
+    SystemClock,
     TopicPublisher,
+    find_members,
+    list_past_events,
+    read_messages,
+    read_records,
+    topics,
 )
-from trilat_net.net.zenoh_bus import RouterSilent
-from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.process import LOOP_NICE, raise_priority
+from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
@@ -573,7 +584,7 @@ class _Bridge:
         self._has_seen_site = False
 
         # Publishers of the ROS topics: of the session, and of each site.
-        frames = graph.publisher(FRAMES, COMMON_TOPICS[FRAMES].kind, RELIABLE)
+        frames = graph.publisher(FRAMES_TOPIC, COMMON_TOPICS[FRAMES_TOPIC].kind, RELIABLE)
         self._diagnostics = graph.publisher(
             DIAGNOSTICS, COMMON_TOPICS[DIAGNOSTICS].kind, RELIABLE
         )

@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import value
+from trilat_net.app import options, value
 from trilat_net.errors import UsageError
-from trilat_net.net.clock import SystemClock
+from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
 from trilat_net.signals import Interrupt
 
@@ -48,19 +47,16 @@ def ros2_command(
             robots.
         rviz: Write a configuration of RViz that shows the arms of the session.
     """
-    from trilat_net.app.running_session import RunningSession
-    from trilat_net.log.ros2.topic_names import read_topic_table
-    from trilat_net.net.host_names import check_hosts
-    from trilat_net.net.ros2_graph import DISTROS, Refusals, Ros2Graph
-    from trilat_net.net.ros2_names import check_ros_name
-    from trilat_net.net.zenoh_config import BRIDGE
+    from trilat_net.app import RunningSession
+    from trilat_net.log.ros2 import TopicTable
+    from trilat_net.net import BRIDGE, DISTROS, Refusals, Ros2Graph, check_hosts, check_ros_name
 
     from .ros2_bridge import serve_ros2
 
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro must be one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
-    table = read_topic_table(names)
+    table = TopicTable.read(names)
     # Checked now, because the bridge would wait for a router at a wrong address forever.
     check_hosts(ros or ())
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))

@@ -13,14 +13,18 @@ Invariant:
 
 from typing import NamedTuple
 
-from trilat_net.app.running_session import ShareHistory
-from trilat_net.core.step.ticks import NS_PER_S
-from trilat_net.log.ros2.published import SiteMessages
-from trilat_net.log.ros2.topic_names import TopicTable
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.messages import LinkStats, State
-from trilat_net.net.ros2_graph import QualityOfService, Ros2Graph, TopicPublisher
+from trilat_net.app import ShareHistory
+from trilat_net.log.ros2 import SiteMessages, TopicTable
+from trilat_net.net import (
+    Bus,
+    Clock,
+    LinkStats,
+    QualityOfService,
+    Ros2Graph,
+    State,
+    TopicPublisher,
+)
+from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario
 
 RELIABLE = QualityOfService()

@@ -21,7 +21,7 @@ from trilat_studies.tuning.candidate import (
 from tests.cli.running import trilat
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
-from trilat_net.work.intervals import mean_interval
+from trilat_net.work.intervals import MeanInterval
 
 DRAWN = """
 name = "drawn"
@@ -57,7 +57,7 @@ def file(tmp_path: Path) -> Path:
 
 def test_intervals_hold_the_truth_in_95_of_100() -> None:
     draws = np.random.default_rng(1).normal(3.0, 1.0, (2000, 5))
-    intervals = [mean_interval(row.tolist()) for row in draws]
+    intervals = [MeanInterval.of_values(row.tolist()) for row in draws]
     holds = [
         abs(interval.mean - 3.0) <= interval.half
         for interval in intervals
@@ -65,7 +65,7 @@ def test_intervals_hold_the_truth_in_95_of_100() -> None:
     ]
     assert len(holds) == 2000
     assert 0.93 < np.mean(holds) < 0.97
-    assert mean_interval([1.0]) is mean_interval([1.0, None]) is None
+    assert MeanInterval.of_values([1.0]) is MeanInterval.of_values([1.0, None]) is None
 
 
 def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:
@@ -73,7 +73,7 @@ def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:
     (row,) = report.rows()
     values = [result.outcomes[0].value for result in report.results]
     assert len(set(values)) == len(SEEDS)
-    assert row.mean == mean_interval(values)
+    assert row.mean == MeanInterval.of_values(values)
     assert row.mean.half > 0.01 * row.mean.mean
     assert str(row.mean) in report.summary()
     again = load_scenario(file, [f"seed={SEEDS[-1]}"])
@@ -102,7 +102,7 @@ def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
         run.advance_to(2.0)
     totals = list_totals(plan)
     for key, mean in zip(totals, point.means, strict=True):
-        assert mean == mean_interval([getattr(run.totals, key) for run in runs])
+        assert mean == MeanInterval.of_values([getattr(run.totals, key) for run in runs])
     assert point.means[0].half > 0.0
     assert point.means[totals.index("force_peak_n")] is None
     assert point.means[totals.index("walls_j")].mean < 0.0
@@ -148,7 +148,7 @@ def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
     text = trilat("compare", "1.mcap", "2.mcap", "3.mcap", "--json", cwd=file.parent).succeeds()
     facts = json.loads(text)
     row = next(row for row in facts["rows"] if row["key"] == "rms_error_rad")
-    assert facts["means"]["rms_error_rad"] == mean_interval(row["values"])._asdict()
+    assert facts["means"]["rms_error_rad"] == MeanInterval.of_values(row["values"])._asdict()
     assert "means" not in json.loads(
         trilat("compare", "1.mcap", "4.mcap", "--json", cwd=file.parent).succeeds()
     )

@@ -40,26 +40,23 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from trilat_net.analysis.theory.characteristic_roots import CharacteristicRoot
-from trilat_net.analysis.theory.floquet import find_samples_in_use
-from trilat_net.analysis.theory.linear_edge import find_rightmost_root
-from trilat_net.analysis.theory.operating_point import (
+from trilat_net.analysis import (
+    CharacteristicRoot,
+    EnvelopeTrend,
     Equilibrium,
     OperatingConditions,
-    derive_operating_conditions,
+    find_rightmost_root,
+    find_samples_in_use,
+    fit_envelopes,
 )
-from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend, fit_envelopes
-from trilat_net.core.step.ticks import BUCKETS_PER_S
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import BUCKETS_PER_S, Array
 from trilat_net.errors import UsageError
-from trilat_net.execution.fused import FusedRun
-from trilat_net.log.log_reader import open_log, read_link_delays
-from trilat_net.presentation.result_text import MARKS, Block, MarkedText, TextTable
+from trilat_net.execution import FusedRun
+from trilat_net.log import open_log, read_link_delays
+from trilat_net.presentation import MARKS, Block, MarkedText, TextTable
 from trilat_net.results import Result, finite_or_none
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.arms import read_arm
-from trilat_net.scenario.laws import BUILT_IN
-from trilat_net.work.executor import Progress, ignore_progress
+from trilat_net.scenario import BUILT_IN, Scenario, load_scenario, read_arm
+from trilat_net.work import Progress, ignore_progress
 
 TUNED_LAWS = tuple(
     name
@@ -441,7 +438,7 @@ class _GainSearch:
         # Damping ratio at the edge, where the damping is the same and K larger by the margin.
         self._damping = damping / math.sqrt(margin)
 
-        self.conditions = derive_operating_conditions(scenario)
+        self.conditions = OperatingConditions.derive(scenario)
         self.constant_conditions = self.conditions
         self.rate_hz = self.conditions.sites[0].rate_hz
         if self.conditions.varying:

@@ -27,25 +27,25 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args, get_type_
 import numpy as np
 from msgspec.structs import replace
 
-from trilat_net.core.arms.task_space import POSITION
-from trilat_net.core.life.own_hand import HandView
-from trilat_net.core.step.site_arrays import SiteArrays
-from trilat_net.core.step.ticks import tick_ns
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import POSITION, Array, HandView, SiteArrays, tick_ns
 from trilat_net.errors import UsageError, count_nouns
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.virtual import record_virtual
+from trilat_net.execution import FusedRun, record_virtual
 from trilat_net.files import import_extra
-from trilat_net.log.orientations import expand_poses
-from trilat_net.scenario import Scenario, find_site, load_scenario
-from trilat_net.scenario.operators.kernel_operators import LiveHand
-from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
-from trilat_net.scenario.plant_player import make_plant_players
+from trilat_net.log import expand_poses
+from trilat_net.scenario import (
+    HandPlayer,
+    HandSite,
+    LiveHand,
+    Scenario,
+    find_site,
+    load_scenario,
+    make_plant_players,
+)
 
 from .reachable_places import can_reach
 
 if TYPE_CHECKING:
-    from trilat_net.presentation.episode_picture import EpisodePicture
+    from trilat_net.presentation import EpisodePicture
 
 try:
     import gymnasium
@@ -807,7 +807,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to draw: call reset first")
         # imported here, because the import of Matplotlib takes a second
-        from trilat_net.presentation.episode_picture import EpisodePicture, is_position
+        from trilat_net.presentation import EpisodePicture, is_position
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self._leads)

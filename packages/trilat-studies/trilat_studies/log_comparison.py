@@ -12,21 +12,20 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.metrics.measures import Metric, Quantity, quantities
+from trilat_net.analysis import Metric, Quantity, certify_run, compute_log_metrics, quantities
 from trilat_net.errors import UsageError, count_nouns, join_words
-from trilat_net.log.log_reader import Log, open_log
-from trilat_net.own_code.code_consent import may_run_user_laws
-from trilat_net.presentation.certificate_text import describe_judgement
-from trilat_net.presentation.result_text import Block, MarkedText, TextTable, format_number
-from trilat_net.results import Result
-from trilat_net.scenario.describe import (
-    ScenarioDifference,
-    compare_scenarios,
+from trilat_net.log import Log, open_log
+from trilat_net.own_code import may_run_user_laws
+from trilat_net.presentation import (
+    Block,
+    MarkedText,
+    TextTable,
+    describe_judgement,
+    format_number,
 )
-from trilat_net.scenario.scenario_reader import reseed_scenario
-from trilat_net.work.intervals import MeanInterval, mean_interval
+from trilat_net.results import Result
+from trilat_net.scenario import ScenarioDifference, compare_scenarios, reseed_scenario
+from trilat_net.work import MeanInterval
 
 from .tuning.candidate import check_final_posture
 
@@ -477,7 +476,7 @@ def _average_repeats(
         return []
     if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
         return []
-    return [mean_interval(row.values) for row in metrics.rows]
+    return [MeanInterval.of_values(row.values) for row in metrics.rows]
 
 
 def _tabulate_quantities(

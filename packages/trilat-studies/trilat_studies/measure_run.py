@@ -25,32 +25,39 @@ import msgspec
 import numpy as np
 
 from trilat_net import process
-from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.metrics.log_metrics import find_quantity, measure_run
-from trilat_net.analysis.metrics.measures import Metric
-from trilat_net.analysis.run_end import (
+from trilat_net.analysis import (
     NO_BUCKETS,
+    Metric,
     RunEnd,
     RunTrace,
     Stability,
-    classify_run_end,
+    build_arm_rows,
+    find_quantity,
+    list_walls,
+    measure_run,
     reduce_to_buckets,
+    wall_force,
 )
-from trilat_net.analysis.torque_sources import list_walls, wall_force
-from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
-from trilat_net.core.step.vectors import Array
-from trilat_net.execution import virtual
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.virtual import simulate_scenario
-from trilat_net.execution.virtual_comparison import find_absent_samples
+from trilat_net.core import BUCKETS_PER_S, Array, Site, compute_fingerprint
+from trilat_net.errors import ScenarioError
+from trilat_net.execution import (
+    FusedRun,
+    execute_virtual,
+    find_absent_samples,
+    simulate_scenario,
+)
 from trilat_net.fields import split_unit
-from trilat_net.log.log_reader import Log
-from trilat_net.log.record_columns import Ints
-from trilat_net.log.site_log import compute_task_errors
-from trilat_net.scenario import Expect, Scenario
-from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
-from trilat_net.scenario.key_checks import field_names
+from trilat_net.log import Ints, Log, collect_provenance, compute_task_errors
+from trilat_net.records import NS_PER_S, Mode, TickRecord
+from trilat_net.scenario import (
+    ALL_SITES_QUANTITIES,
+    END_WINDOW_S,
+    Expect,
+    ExpectWindow,
+    Scenario,
+    field_names,
+    refuse_external_arms,
+)
 
 BATCH_RECORDS = 1000
 """Number of records of a site in a batch."""
@@ -226,7 +233,7 @@ def run_in_batches(
         records.clear()
 
     with process.pause_gc():
-        for site, _, output in virtual.execute_virtual(scenario):
+        for site, _, output in execute_virtual(scenario):
             sites[site.name] = site
             site_records = pending[site.name]
             site_records.append(output)
@@ -325,7 +332,7 @@ def run_whole(scenario: Scenario) -> _WholeRun:
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
     trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return _WholeRun(records, classify_run_end(scenario, trace), run)
+    return _WholeRun(records, trace.classify_end(scenario), run)
 
 
 class Range(NamedTuple):
@@ -784,7 +791,7 @@ def _compute_run_metrics(
 
     return RunMetrics(
         simulated_s=max(durations_s, default=0.0),
-        end=classify_run_end(scenario, trace),
+        end=trace.classify_end(scenario),
         synchronised_at_s=synchronised_at_s,
         peak_error_rad=find_largest("peak_error_rad"),
         rms_error_rad=find_largest("rms_error_rad"),
@@ -1213,3 +1220,46 @@ def _compare_with_range(
         margin=distance / half_width if half_width else None,
         value=measured.most if is_single_value else None,
     )
+
+
+# Packages that compute the results, by their keys in the provenance of a log.
+_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
+
+
+def describe_program() -> tuple[str, dict[str, str]]:
+    """Returns the properties of this program and machine on which numerical results depend.
+
+    Results of a study are mixed only if these properties are the same.
+
+    Returns:
+        A fingerprint of how the machine rounds floating point numbers; and the versions of the
+        program and of the packages that compute the results.
+    """
+    provenance = collect_provenance()
+    versions = {name: provenance[name] for name in _VERSIONS}
+    return compute_fingerprint(), versions
+
+
+def refuse_live_only(scenario: Scenario) -> None:
+    """Refuses a scenario that only a live session can run.
+
+    A live session has a real network, and may have real robots.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Raises:
+        ScenarioError: An arm is external, or a link has the model "measured": it injects no
+            delay: the real network decides. In virtual time there is no real network.
+    """
+    refuse_external_arms(scenario)
+    if scenario.measured:
+        measured_links = [name for name, link in scenario.links.items() if link.measured]
+        path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
+        raise ScenarioError(
+            "is 'measured', the delay of a real network: a scenario with such a link can only "
+            "run live; to run the scenario here, set another model, as in link.model=constant "
+            "and link.delay_ms=50",
+            path=path,
+            source=scenario.name,
+        )

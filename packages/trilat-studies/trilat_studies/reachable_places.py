@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trilat_net.core.step.vectors import Array
-from trilat_net.scenario.arms import ArmModel
+from trilat_net.core import Array
+from trilat_net.scenario import ArmModel
 
 PLANAR_MARGIN = 0.01
 """Fraction of a planar arm's length by which a position must lie inside its reach, so that no

@@ -20,11 +20,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import flag, value
-from trilat_net.app.cli.run_progress import run_in_own_folder, show_progress
+from trilat_net.app import flag, options, run_in_own_folder, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
-from trilat_net.net.clock import SystemClock
+from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
 
 if TYPE_CHECKING:
@@ -80,7 +78,7 @@ def test_command(
     failure, the command that repeats the run is printed.
     """
     from trilat_net.files import write_whole
-    from trilat_net.work.executor import check_workers
+    from trilat_net.work import check_workers
 
     from .trials import encode_junit_xml
 
@@ -242,7 +240,7 @@ def _run_tuning(
         as_json: True to print the result as JSON.
     """
     from trilat_net.files import make_results_folder
-    from trilat_net.work.executor import count_workers
+    from trilat_net.work import count_workers
 
     from .tuning.tuning_report import describe_procedure, write_tuning
 
@@ -450,7 +448,7 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
     if not names_session:
         return text
 
-    from trilat_net.app.session_ping import ping_session
+    from trilat_net.app import ping_session
 
     measurement = ping_session(
         connection=reach.resolve(operates=False),
@@ -587,12 +585,12 @@ def bench_command(
         output: Folder for the results; a suite that the folder already contains is continued.
             Default: runs/bench-STUDY.
     """
-    from trilat_net.work.executor import check_workers
-    from trilat_net.work.study_folder import format_command
+    from trilat_net.work import check_workers
 
     from .bench import plan_bench, prepare_bench_folder
     from .bench.bench_figures import write_bench
     from .bench.bench_plan import find_stale
+    from .run_commands import format_command
 
     check_workers(jobs, on)
     chosen_study = "small" if small else study

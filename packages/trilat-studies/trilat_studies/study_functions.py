@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trilat_net.app.api import AnyScenario, Overrides
-from trilat_net.work.study_folder import list_assignments
+from trilat_net.app import AnyScenario, Overrides
+
+from .run_commands import list_assignments
 
 if TYPE_CHECKING:
-    from trilat_net.work.executor import Workers
+    from trilat_net.work import Workers
 
     from .bench import BenchResults
     from .sweep.margin_search import SweepMargins

@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app.cli import options
-from trilat_net.app.cli.options import flag, value
-from trilat_net.app.cli.run_progress import show_progress
+from trilat_net.app import flag, options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
 from trilat_net.presentation import terminal_output as terminal
 
@@ -82,7 +80,7 @@ def _draw_map(
         on: Address of a Dask scheduler that computes the map instead.
         beside: Folder of another sweep, whose edge is drawn as well. None draws no other edge.
     """
-    from trilat_net.presentation.appearance import COLUMN_IN, make_print_size
+    from trilat_net.presentation import COLUMN_IN, FigureSize
 
     from .sweep import read_results
     from .sweep.fixed_gains import FAIR_COMPARISON
@@ -90,7 +88,7 @@ def _draw_map(
     from .sweep.stability_map import build_stability_map
     from .sweep.sweep_plan import build_sweep_command
 
-    size = make_print_size(COLUMN_IN if width is None else width)
+    size = FigureSize.for_print(COLUMN_IN if width is None else width)
     width_option = [] if width is None else ["--width", f"{width:g}"]
     beside_option = [] if beside is None else ["--beside", str(beside)]
     command = build_sweep_command(results.plan, "--map", *width_option, *beside_option)
@@ -175,7 +173,7 @@ def _run_sweep(
     Returns:
         The finished sweep.
     """
-    from trilat_net.work.executor import count_workers
+    from trilat_net.work import count_workers
 
     from .sweep import sweep_results, sweep_run
     from .sweep.cell_groups import find_cell_groups

@@ -43,21 +43,17 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import asdict
 
-from trilat_net.analysis.metrics.log_metrics import find_quantity
-from trilat_net.core.step.jit import is_core_cached
+from trilat_net.analysis import find_quantity
+from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
-from trilat_net.execution import virtual
-from trilat_net.execution.verify import verify
-from trilat_net.log.log_reader import open_log
-from trilat_net.net.clock import SystemClock
-from trilat_net.own_code.code_consent import list_imported_code
-from trilat_net.presentation.result_text import Block, MarkedText, TextTable
+from trilat_net.execution import check_virtual, execute_virtual, verify
+from trilat_net.log import open_log
+from trilat_net.net import SystemClock
+from trilat_net.own_code import list_imported_code
+from trilat_net.presentation import Block, MarkedText, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.scenario_reader import read_experiment, reseed_scenario
-from trilat_net.work.executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
-from trilat_net.work.intervals import MeanInterval, mean_interval
-from trilat_net.work.study_folder import format_command, list_assignments, set_options
+from trilat_net.scenario import ExperimentText, Scenario, load_scenario, reseed_scenario
+from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
 
 from .measure_run import (
     ExpectationResult,
@@ -66,6 +62,7 @@ from .measure_run import (
     measure_log,
     measure_virtual_run,
 )
+from .run_commands import format_command, list_assignments, set_options
 
 
 class TrialResult(NamedTuple):
@@ -214,10 +211,10 @@ def trials(
             expectations.
     """
     scenario = load_scenario(source, set)
-    label = read_experiment(source).label
+    label = ExperimentText.read(source).label
     _check_expectations_reachable(scenario, label)
     if not live:
-        virtual.check_virtual(scenario)
+        check_virtual(scenario)
 
     distinct_seeds = list(dict.fromkeys(seeds)) or [scenario.seed]
     for seed in distinct_seeds:
@@ -408,7 +405,7 @@ class TrialReport(Result):
                     worst=worst,
                     held=sum(outcome.held for outcome in outcomes),
                     runs=len(outcomes),
-                    mean=mean_interval([outcome.value for outcome in outcomes]),
+                    mean=MeanInterval.of_values([outcome.value for outcome in outcomes]),
                 )
                 rows.append(row)
 
@@ -604,7 +601,7 @@ def _iterate_results(
 
     if not is_core_cached():
         # The first step compiles the simulation kernel, once for all processes.
-        next(virtual.execute_virtual(batch[0].scenario))
+        next(execute_virtual(batch[0].scenario))
     # The longest trials run first, so that no worker is left with a long trial at the end.
     longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
     queue = [batch[n] for n in longest_first]

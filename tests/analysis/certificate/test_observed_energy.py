@@ -17,8 +17,8 @@ from tests.log_editing import edited, opened, recorded
 from tests.unit_arm import hand, unit_scenario
 from trilat_net.analysis.certificate.observed_energy import (
     NEGATIVE_ENERGY_MEANING,
+    ObservedEnergy,
     ObservedFinding,
-    observe_energies,
 )
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_end import Stability
@@ -71,7 +71,7 @@ def test_a_line_at_rest_is_a_spring() -> None:
     force squared times T / b.
     """
     log = clamped()
-    energies = observe_energies(log, own_laws=True)
+    energies = ObservedEnergy.of_log(log, own_laws=True)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
     assert {energy.name for energy in energies.least} >= {"line m->s", "line s->m"}
@@ -107,17 +107,21 @@ def test_waves_held_over_an_outage_add_energy() -> None:
 
 
 def test_books_detect_a_law_sending_too_much() -> None:
-    energies = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
+    energies = ObservedEnergy.of_log(
+        clamped(control__boost=1.01, duration_s=2.0), own_laws=True
+    )
     assert energies.finding is ObservedFinding.BROKEN
     assert energies.residual_j > 1e-4
 
 
 def test_code_from_outside_runs_only_on_request() -> None:
     log = clamped()
-    assert observe_energies(log) is None
+    assert ObservedEnergy.of_log(log) is None
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
     mixed = simulate_scenario(load_scenario(log.scenario, silent))
-    assert observe_energies(mixed, own_laws=True).text.endswith("the law of s declares none")
+    assert ObservedEnergy.of_log(mixed, own_laws=True).text.endswith(
+        "the law of s declares none"
+    )
 
 
 def test_the_certificate_reports_it_in_text_and_json() -> None:
@@ -144,7 +148,7 @@ def run(law: str) -> Log:
 @pytest.mark.parametrize("law", LAWS)
 def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> None:
     log = run(law)
-    energies = observe_energies(log)
+    energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
     assert energies.residual_j <= 1e-12 * energies.largest_j
@@ -197,7 +201,7 @@ def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
     """As published: the follower's damper uses a velocity with which the follower is not moved."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
-    energies = observe_energies(log)
+    energies = ObservedEnergy.of_log(log)
     taken = next(energy for energy in energies.least if energy.name == "taken by s")
     assert energies.finding is ObservedFinding.NEGATIVE
     assert taken.amount_j < -1e-3
@@ -209,7 +213,7 @@ def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
     log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
-    energies = observe_energies(log)
+    energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert next(
         premise for premise in energies.premises if premise.name == "torque"
@@ -237,7 +241,7 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
     for name, beta in (("m2", 0.5), ("s", 1.5)):
         sites[name]["control"] = {**control, "beta": beta}
     scenario = unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
-    energies = observe_energies(simulate_scenario(scenario))
+    energies = ObservedEnergy.of_log(simulate_scenario(scenario))
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
 
@@ -250,9 +254,9 @@ def test_missing_law_memory_in_records_is_reported(mem: list[float]) -> None:
     broken = edited(
         data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
     )
-    assert observe_energies(opened(data)).curves
+    assert ObservedEnergy.of_log(opened(data)).curves
     with pytest.raises(LogError, match="a record of s does not have"):
-        observe_energies(opened(broken))
+        ObservedEnergy.of_log(opened(broken))
 
 
 def test_three_texts_explain_negative_energy_alike() -> None:

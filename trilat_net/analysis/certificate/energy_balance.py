@@ -26,9 +26,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ...core.step.site_setup import Scheme
-from ...core.step.vectors import Array
-from ...log.log_reader import Log
+from ...core import Array, Scheme
+from ...log import Log
 from ...scenario import Scenario
 from ..aligned import (
     AlignedRecords,
@@ -39,7 +38,7 @@ from ..aligned import (
     view_delayed_peer,
 )
 from ..dominance_history import DominanceHistory, compute_lyapunov_weights, trace_dominance
-from ..torque_sources import split_torque
+from ..torque_sources import TorqueSplit
 from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion
 
@@ -304,7 +303,7 @@ def derive_site_energies(
             constants=constants[site],
             dominance=dominance(site, site_records.t_s),
             peers=peers,
-            torque=split_torque(site_records, scenario),
+            torque=TorqueSplit.of_records(site_records, scenario),
             scheme=Scheme[scenario.scheme.upper()],
             common=common_axes,
         )

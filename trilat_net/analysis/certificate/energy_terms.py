@@ -38,9 +38,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.step.site_setup import Scheme
-from ...core.step.vectors import Array
-from ...log.record_columns import Ints
+from ...core import Array, Scheme
+from ...log import Ints
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows

@@ -22,14 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
-from ...core.step.site_setup import Scheme, StaleAction
-from ...core.step.vectors import Array
+from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction, sum_work
 from ...errors import count_nouns
-from ...log.log_reader import Log
-from ...own_code.imported_code import ImportedLaw
+from ...log import Log
+from ...own_code import ImportedLaw
 from ...results import JsonObject
-from ...scenario.scenario_types import Scenario
+from ...scenario import Scenario
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premise_quantities import (
@@ -126,7 +124,7 @@ class _LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Verdict on the energies that control laws declare, computed by `observe_energies`.
+    """Verdict on the energies that control laws declare, computed by `ObservedEnergy.of_log`.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
@@ -162,6 +160,45 @@ class ObservedEnergy(NamedTuple):
         content["premises"] = [premise.to_json() for premise in self.premises]
         content["least"] = [least._asdict() for least in self.least]
         return content
+
+    @classmethod
+    def of_log(cls, log: Log, *, own_laws: bool = False) -> "ObservedEnergy | None":
+        """Checks the energies that the control laws of a log declare against the motion.
+
+        Args:
+            log: The log of the run.
+            own_laws: True to also evaluate laws that are not part of this program, which runs
+                their code.
+
+        Returns:
+            The verdict. None if no law declares energies.
+
+        Raises:
+            LogError: A record cannot be read.
+            ScenarioError: The file of a law that is not part of this program is missing.
+        """
+        laws = find_energy_laws(log.scenario, own_laws=own_laws)
+        if not laws:
+            return None
+
+        unjudged = ObservedFinding.NOT_JUDGED
+        silent = [site for site in log.sites if site not in laws]
+        if silent:
+            text = f"{unjudged}: the law of {', '.join(silent)} declares none"
+            return ObservedEnergy(unjudged, text)
+
+        parts = {site: log[site] for site in log.sites}
+        incomplete = []
+        for site, part in parts.items():
+            # a first tick above 0 means that records before it are missing
+            if not len(part) or part.missing or part.tick[0]:
+                incomplete.append(site)
+        if incomplete:
+            text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
+            return ObservedEnergy(unjudged, text)
+
+        books = {site: _read_books(log, site, law) for site, law in laws.items()}
+        return _judge_books(log, books)
 
 
 class _SiteBooks(NamedTuple):
@@ -204,45 +241,6 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
             if callable(getattr(law, "energies", None)):
                 laws[site] = law
     return laws
-
-
-def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
-    """Checks the energies that the control laws of a log declare, against the recorded motion.
-
-    Args:
-        log: The log of the run.
-        own_laws: True to also evaluate laws that are not part of this program, which runs their
-            code.
-
-    Returns:
-        The verdict. None if no law declares energies.
-
-    Raises:
-        LogError: A record cannot be read.
-        ScenarioError: The file of a law that is not part of this program is missing.
-    """
-    laws = find_energy_laws(log.scenario, own_laws=own_laws)
-    if not laws:
-        return None
-
-    unjudged = ObservedFinding.NOT_JUDGED
-    silent = [site for site in log.sites if site not in laws]
-    if silent:
-        text = f"{unjudged}: the law of {', '.join(silent)} declares none"
-        return ObservedEnergy(unjudged, text)
-
-    parts = {site: log[site] for site in log.sites}
-    incomplete = []
-    for site, part in parts.items():
-        # a first tick above 0 means that records before it are missing
-        if not len(part) or part.missing or part.tick[0]:
-            incomplete.append(site)
-    if incomplete:
-        text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
-        return ObservedEnergy(unjudged, text)
-
-    books = {site: _read_books(log, site, law) for site, law in laws.items()}
-    return _judge_books(log, books)
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:

@@ -27,10 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...log.accounting import Coverage
-from ...log.log_reader import Log
-from ...log.session_check import judge_integrity
-from ...net.messages import HALTED_MODES
+from ...log import Coverage, Log, judge_integrity
+from ...net import HALTED_MODES
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited_rows
 from ..dominance_history import (

@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.step.ticks import CoreChange
-from ...core.step.vectors import Array
+from ...core import Array, CoreChange
 from ...hooks import find_hook
-from ...net.messages import RESTING_MODES, TASK_VECTORS, State
+from ...net import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
     RECORD_COLUMNS,

@@ -27,12 +27,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ...core.step.vectors import Array
+from ...core import Array
 from ...hooks import find_hook
-from ...log.accounting import MIN_COVERAGE
-from ...log.log_reader import Log
+from ...log import MIN_COVERAGE, Log
 from ...results import JsonObject, Result, finite_or_none
-from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
+from ..run_end import EndBehaviour, RunEnd, Stability
 from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability
 from ..twins.twin_growth import TwinGrowth
 from . import energy_terms
@@ -44,7 +43,7 @@ from .energy_balance import (
     compute_energy_balance,
     rise_above_minimum,
 )
-from .observed_energy import ObservedEnergy, ObservedFinding, observe_energies
+from .observed_energy import ObservedEnergy, ObservedFinding
 from .premise_quantities import Premise
 from .premises import (
     FunctionalFacts,
@@ -358,9 +357,9 @@ def certify(
     certificate = Certificate(
         premises=premises,
         verdict=verdict,
-        end=classify_log_end(log),
+        end=RunEnd.of_log(log),
         evidence=collect_evidence(run, min_coverage),
-        observed=observe_energies(log, own_laws=own_laws),
+        observed=ObservedEnergy.of_log(log, own_laws=own_laws),
     )
     if facts is None:
         return certificate

@@ -14,8 +14,7 @@ from enum import Enum, auto
 from typing import Any, NamedTuple
 
 from ...hooks import find_hook
-from ...log.accounting import Coverage
-from ...log.running_digest import Integrity
+from ...log import Coverage, Integrity
 from .premise_quantities import MissingFunctional, PremiseQuantities
 
 

@@ -21,12 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arms.task_space import POSITION
+from ...core import POSITION
 from ...errors import count_nouns, suggest_nearest
-from ...log.log_reader import Log
+from ...log import Log
 from ...results import Result
-from ...scenario import Scenario
-from ...scenario.arms import TASK_AXES
+from ...scenario import TASK_AXES, Scenario
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
 from . import static_windows

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.vectors import Array
+from ...core import Array
 from ..aligned import Bools, find_latest_rows
 from ..run_view import RunView, SiteRun
 

@@ -19,8 +19,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.arms.task_space import POSITION
-from ...core.step.vectors import Array
+from ...core import POSITION, Array
 from ..run_view import RunView
 
 

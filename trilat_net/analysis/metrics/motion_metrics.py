@@ -22,14 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arms.task_space import POSE, POSITION
-from ...core.step.site_setup import Law
-from ...core.step.vectors import Array
-from ...log.orientations import choose_nearest_vectors
-from ...log.site_log import compute_task_errors
+from ...core import POSE, POSITION, Array, Law
+from ...log import choose_nearest_vectors, compute_task_errors
 from ...results import JsonObject
-from ...scenario import Scenario
-from ...scenario.expect import END_WINDOW_S
+from ...scenario import END_WINDOW_S, Scenario
 from .. import site_signals
 from ..aligned import AlignedRecords, Bools, PeerTrajectory, find_common_rows
 from ..arm_rows import (

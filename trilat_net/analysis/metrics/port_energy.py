@@ -19,10 +19,8 @@ and S_i for each law, and the sources.
 
 import numpy as np
 
-from ...core.step.site_setup import Gains, Law, Scheme
-from ...core.step.vectors import Array
-from ...scenario import Scenario
-from ...scenario.laws import identify_law
+from ...core import Array, Gains, Law, Scheme
+from ...scenario import Scenario, identify_law
 from ..aligned import (
     AlignedRecords,
     DelayedPeer,

@@ -28,12 +28,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arms.exogenous import TorqueKind
-from ...core.step.site_setup import Law
-from ...core.step.vectors import Array
-from ...log.record_columns import Ints
-from ...scenario import Scenario
-from ...scenario.laws import identify_law
+from ...core import Array, Law, TorqueKind
+from ...log import Ints
+from ...scenario import Scenario, identify_law
 from ..aligned import Bools, find_latest_rows
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from ...core.arms.task_space import POSITION
+from ...core import POSITION
 from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
 from ..dominance_history import (
     RAMP_TIME_TOLERANCE_S,

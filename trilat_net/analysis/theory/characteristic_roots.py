@@ -41,7 +41,7 @@ from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 from scipy.linalg import eigvals
 
-from ...core.step.vectors import Array
+from ...core import Array
 from .linear_loop import LinearLoop
 
 Complex = NDArray[np.complex128]

@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.vectors import Array
+from ...core import Array
 from ...errors import count_nouns
 from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop

@@ -18,19 +18,16 @@ from contextlib import suppress
 import msgspec
 import numpy as np
 
-from ...core.step.site_setup import Law, SiteSetup
-from ...core.step.ticks import BUCKETS_PER_S
-from ...core.step.vectors import Array
+from ...core import BUCKETS_PER_S, Array, Law, SiteSetup
 from ...errors import ScenarioError, UsageError, count_nouns
-from ...execution.fused import FusedRun
-from ...own_code.imported_code import ImportedLaw
-from ...scenario import Scenario
-from ...scenario.operators.kernel_operators import Chirp, Multisine
+from ...execution import FusedRun
+from ...own_code import ImportedLaw
+from ...scenario import Chirp, Multisine, Scenario
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop
 from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
     compute_following,
     describe_switching_points,
@@ -370,7 +367,7 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
             its run.
         UsageError: The pose does not consist of as many finite numbers as expected.
     """
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     if pose is None:
         rest = _find_at_run_end(scenario, conditions)
     else:
@@ -401,7 +398,7 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
     Raises:
         ScenarioError: The scenario has no linear loop, or no equilibrium near the prediction.
     """
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     return _require_equilibrium(scenario, _predict_from_start(conditions, scenario))
 
 
@@ -419,7 +416,7 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     Raises:
         ScenarioError: The scenario cannot be linearised, or has no equilibrium near `rest`.
     """
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
     if conditions.has_forms:
         return start
@@ -447,7 +444,7 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
     Raises:
         ScenarioError: The scenario cannot be linearised, or no equilibrium was found.
     """
-    sites = derive_operating_conditions(scenario).sites
+    sites = OperatingConditions.derive(scenario).sites
     if any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites):
         return find_equilibrium(scenario)
     if all(site.gains.law is Law.KNOWN for site in sites):
@@ -604,7 +601,7 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     Args:
         scenario: The description of the experiment.
     """
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])
     equal_alpha = np.full((count, count), 1.0 / count)

@@ -47,10 +47,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from ...core.step.site_setup import Law, Scheme, SiteSetup
-from ...core.step.vectors import Array, IntArray
-from ...scenario.delay_models import LinkBase
-from ...scenario.sample_uses import draw_used_samples
+from ...core import Array, IntArray, Law, Scheme, SiteSetup
+from ...scenario import LinkBase, draw_used_samples
 from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from .characteristic_roots import (
     NAMED_SHARE,

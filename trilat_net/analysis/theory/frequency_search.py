@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.vectors import Array
+from ...core import Array
 from .characteristic_roots import Complex
 from .port_response import PortResponse
 

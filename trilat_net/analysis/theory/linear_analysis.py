@@ -26,16 +26,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.step.vectors import Array
+from ...core import Array
 from ...errors import ScenarioError, UsageError
-from ...execution.fused import FusedRun
-from ...log.log_reader import Log
+from ...execution import FusedRun
+from ...log import Log
 from ...results import Result
-from ...scenario import Scenario, load_scenario
-from ...scenario.describe import (
+from ...scenario import (
     IRREVERSIBLE_SHARES,
+    Scenario,
     describe_law_conditions,
     lacks_detailed_balance,
+    load_scenario,
 )
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
@@ -46,7 +47,7 @@ from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
 from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
 from .numeric_law import NumericLaw
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .port_passivity import HandMatrices
 
@@ -299,7 +300,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
         scenario: The scenario of the run.
         log: The log of the run. None to simulate the run.
     """
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     try:
         if log is not None:
             scenario = resolve_final_scenario(log)
@@ -359,7 +360,7 @@ def analyse_linear_loop(
         log = source if isinstance(source, Log) and not overrides else None
         analysed = _find_end_loop(scenario, log)
     else:
-        conditions = derive_operating_conditions(scenario)
+        conditions = OperatingConditions.derive(scenario)
         analysed = _AnalysedLoop(scenario, conditions, find_equilibrium(scenario, pose))
     scenario = analysed.scenario
     conditions = analysed.conditions

@@ -24,9 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ...core.arms.exogenous import TorqueKind
-from ...core.step.site_setup import Law
-from ...core.step.vectors import Array
+from ...core import Array, Law, TorqueKind
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, load_scenario
 from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
@@ -38,7 +36,7 @@ from .equilibrium import (
 )
 from .floquet import compute_sampled_spectrum
 from .linear_loop import linearise_loop
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import place_arm
 
 EDGE_SCAN_POINTS = 24
@@ -58,8 +56,6 @@ ASSUMED_EQUILIBRIUM_REMARK = (
     "the linear analysis of a law that learns is about the mean start pose, with true "
     "estimates: the equilibrium of a run depends on its whole history"
 )
-
-
 MEAN_POSE_REMARK = (
     "about the rest that is nearest to the mean start pose: where estimates, operators and "
     "walls move the arms to, only a run shows"
@@ -143,10 +139,10 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
     try:
         # refuses imported laws, because their memory is not among the arguments
-        derive_operating_conditions(scenario, own_laws=False)
+        OperatingConditions.derive(scenario, own_laws=False)
         state = Equilibrium(q[deepest], theta_hat[deepest], "", 0.0)
         rest = follow_equilibrium(scenario, state)
-        root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
+        root = find_rightmost_root(OperatingConditions.derive(scenario), rest, sampled=True)
     except ScenarioError:
         return np.nan
     return -np.inf if root is None else root.s.real
@@ -322,7 +318,7 @@ class _GrowthRate:
         """
         typed_value = round(value) if self.takes_integers else value
         scenario = load_scenario(self._scenario, {self._key: typed_value})
-        conditions = derive_operating_conditions(scenario)
+        conditions = OperatingConditions.derive(scenario)
         self._rest = follow_equilibrium(scenario, self._rest)
         sampled = self._sampled
         if sampled is None:
@@ -390,60 +386,64 @@ class GrowthColumn(NamedTuple):
     remarks: list[str]
     is_sampled: bool = False
 
+    @classmethod
+    def compute(
+        cls,
+        scenarios: Sequence[Scenario],
+        key: str,
+        values: Sequence[float],
+        *,
+        at_mean_pose: bool = False,
+    ) -> "GrowthColumn":
+        """Computes how the growth of small motions depends on one setting of a scenario.
 
-def compute_growth_column(
-    scenarios: Sequence[Scenario],
-    key: str,
-    values: Sequence[float],
-    *,
-    at_mean_pose: bool = False,
-) -> GrowthColumn:
-    """Computes how the growth of small motions depends on one setting of a scenario.
+        For each value of the setting, the coupled arms are linearised about a pose of rest.
+        This pose is followed from one value to the next. Between two neighbouring values of
+        which exactly one gives an unstable loop, the value at which stability changes is
+        searched.
 
-    For each value of the setting, the coupled arms are linearised about a pose of rest. This
-    pose is followed from one value to the next. Between two neighbouring values of which
-    exactly one gives an unstable loop, the value at which stability changes is searched.
+        Args:
+            scenarios: The experiments, which differ in the setting only, by its rising value.
+            key: Name of the setting, such as "control.d".
+            values: Values of the setting, one per scenario.
+            at_mean_pose: True to linearise each scenario about the rest that is nearest to the
+                mean of its start poses, with true estimates. No run is simulated then.
 
-    Args:
-        scenarios: The experiments, which differ in the setting only, by its rising value.
-        key: Name of the setting, such as "control.d".
-        values: Values of the setting, one per scenario.
-        at_mean_pose: True to linearise each scenario about the rest that is nearest to the mean
-            of its start poses, with true estimates. No run is simulated then.
+        Returns:
+            The growth rates, and the values at which stability changes. A value of change is
+            missing if the setting does not allow the numbers that the search needs.
+        """
+        rest: Equilibrium | None = None
+        column = GrowthColumn([], {}, [])
+        for n, scenario in enumerate(scenarios):
+            try:
+                if at_mean_pose:
+                    rest, remark = _find_mean_equilibrium(scenario)
+                else:
+                    rest, remark = _assume_equilibrium(scenario, rest)
+                conditions = OperatingConditions.derive(scenario)
+                is_sampled = conditions.needs_sampled_loop and not conditions.has_forms
+                column = column._replace(is_sampled=column.is_sampled or is_sampled)
+                root = find_rightmost_root(conditions, rest, sampled=is_sampled)
+                column.growth_per_s.append(-np.inf if root is None else root.s.real)
+                if n > 0:
+                    left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
+                    right = _GrowthPoint(values[n], column.growth_per_s[-1])
+                    is_finite = np.isfinite([left.growth_per_s, right.growth_per_s]).all()
+                    if is_finite and left.is_unstable != right.is_unstable:
+                        # evaluated again from one equilibrium, both ends may have the same sign
+                        with suppress(ScenarioError, ValueError):
+                            edge = _GrowthRate(scenario, key, rest, None).close_edge(
+                                left, right
+                            )
+                            column.edges[n - 1] = edge.value
+            except ScenarioError as error:
+                remark = f"no linear analysis: {error.problem}"
+                column.growth_per_s.append(float("nan"))
+            if remark and remark not in column.remarks:
+                column.remarks.append(remark)
 
-    Returns:
-        The growth rates, and the values at which stability changes. A value of change is
-        missing if the setting does not allow the numbers that the search needs.
-    """
-    rest: Equilibrium | None = None
-    column = GrowthColumn([], {}, [])
-    for n, scenario in enumerate(scenarios):
-        try:
-            if at_mean_pose:
-                rest, remark = _find_mean_equilibrium(scenario)
-            else:
-                rest, remark = _assume_equilibrium(scenario, rest)
-            conditions = derive_operating_conditions(scenario)
-            is_sampled = conditions.needs_sampled_loop and not conditions.has_forms
-            column = column._replace(is_sampled=column.is_sampled or is_sampled)
-            root = find_rightmost_root(conditions, rest, sampled=is_sampled)
-            column.growth_per_s.append(-np.inf if root is None else root.s.real)
-            if n > 0:
-                left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
-                right = _GrowthPoint(values[n], column.growth_per_s[-1])
-                is_finite = np.isfinite([left.growth_per_s, right.growth_per_s]).all()
-                if is_finite and left.is_unstable != right.is_unstable:
-                    # evaluated again from one equilibrium, both ends may have the same sign
-                    with suppress(ScenarioError, ValueError):
-                        edge = _GrowthRate(scenario, key, rest, None).close_edge(left, right)
-                        column.edges[n - 1] = edge.value
-        except ScenarioError as error:
-            remark = f"no linear analysis: {error.problem}"
-            column.growth_per_s.append(float("nan"))
-        if remark and remark not in column.remarks:
-            column.remarks.append(remark)
-
-    return column
+        return column
 
 
 def find_root_crossings(
@@ -474,23 +474,6 @@ def find_root_crossings(
         return (), f"no linear analysis: {error.problem}"
 
 
-def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
-    """Returns the equilibrium that is nearest to the mean of the start poses.
-
-    Args:
-        scenario: The experiment.
-
-    Returns:
-        The equilibrium.
-        A remark on the assumption. Empty if all arms and nothing else decide where they rest.
-    """
-    mean = find_equilibrium(scenario, find_mean_pose(scenario))
-    rest = follow_equilibrium(scenario, mean)
-    sites = derive_operating_conditions(scenario).sites
-    is_moved = any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites)
-    return rest, MEAN_POSE_REMARK if is_moved else ""
-
-
 def _assume_equilibrium(
     scenario: Scenario, previous: Equilibrium | None
 ) -> tuple[Equilibrium, str]:
@@ -507,7 +490,7 @@ def _assume_equilibrium(
         The equilibrium.
         A remark on the assumption. Empty if none was made.
     """
-    sites = derive_operating_conditions(scenario).sites
+    sites = OperatingConditions.derive(scenario).sites
     is_adaptive = any(site.gains.law is Law.ADAPTIVE for site in sites)
     has_actors = any(site.actors for site in sites)
     if is_adaptive and not has_actors:
@@ -516,3 +499,20 @@ def _assume_equilibrium(
     if previous is None:
         return choose_equilibrium(scenario), ""
     return follow_equilibrium(scenario, previous), ""
+
+
+def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
+    """Returns the equilibrium that is nearest to the mean of the start poses.
+
+    Args:
+        scenario: The experiment.
+
+    Returns:
+        The equilibrium.
+        A remark on the assumption. Empty if all arms and nothing else decide where they rest.
+    """
+    mean = find_equilibrium(scenario, find_mean_pose(scenario))
+    rest = follow_equilibrium(scenario, mean)
+    sites = OperatingConditions.derive(scenario).sites
+    is_moved = any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites)
+    return rest, MEAN_POSE_REMARK if is_moved else ""

@@ -30,10 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, qr
 
-from ...core.arms.task_space import POSITION
-from ...core.step.site_setup import SiteSetup
-from ...core.step.vectors import Array
-from ...laws.conditions import BlockKey, LinearForm
+from ...core import POSITION, Array, SiteSetup
+from ...laws import BlockKey, LinearForm
 from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions

@@ -29,19 +29,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ...core.links.philox import link_key
-from ...core.step.ticks import BUCKETS_PER_S, NS_PER_S
-from ...core.step.vectors import Array
+from ...core import BUCKETS_PER_S, Array, link_key
 from ...errors import ScenarioError, join_words
-from ...execution.fused import FusedRun
-from ...execution.virtual import simulate_scenario
-from ...log.log_reader import Log
-from ...log.record_columns import Ints
-from ...own_code.imported_code import ImportedLaw
-from ...scenario import Scenario
-from ...scenario.delay_models import LinkBase
-from ...scenario.delay_models.kernel_delays import ConstantDelay
-from ...scenario.sample_uses import draw_used_samples
+from ...execution import FusedRun, simulate_scenario
+from ...log import Ints, Log
+from ...own_code import ImportedLaw
+from ...records import NS_PER_S
+from ...scenario import ConstantDelay, LinkBase, Scenario, draw_used_samples
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
@@ -52,11 +46,7 @@ from .equilibrium import follow_equilibrium, pad_rows, settle_memories
 from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
 from .linear_edge import find_deepest_contact
 from .linear_loop import linearise_loop
-from .operating_point import (
-    Equilibrium,
-    OperatingConditions,
-    derive_operating_conditions,
-)
+from .operating_point import Equilibrium, OperatingConditions
 
 _SAME_POSE_RAD = 1e-6
 """Poses that differ by less have the same roots, in rad."""
@@ -330,7 +320,7 @@ def _build_end_loop(
     Raises:
         ScenarioError: The loop cannot be linearised, or has no equilibrium near the state.
     """
-    conditions = derive_operating_conditions(final.scenario, own_laws=own_laws)
+    conditions = OperatingConditions.derive(final.scenario, own_laws=own_laws)
     for pair, age_s in final.mean_age_s.items():
         conditions.age_s[pair] = age_s
     end = Equilibrium(state.q, state.estimates, state.how, 0.0)

@@ -28,13 +28,19 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arms import chain_stages, two_link_stages
-from ...core.plug.compiled_law import plug_law
-from ...core.plug.user_law import LawContext, UserLaw, list_remembered, read_memory
-from ...core.step.site_arrays import build_site_arrays
-from ...core.step.site_setup import SiteSetup
-from ...core.step.ticks import tick_ns
-from ...core.step.vectors import Array
+from ...core import (
+    Array,
+    LawContext,
+    SiteArrays,
+    SiteSetup,
+    UserLaw,
+    chain_stages,
+    list_remembered,
+    plug_law,
+    read_memory,
+    tick_ns,
+    two_link_stages,
+)
 from ...errors import ScenarioError
 from ..arm_rows import Numbers
 
@@ -86,7 +92,7 @@ class NumericLaw:
         assert setup.law_factory is not None
         self._law = setup.law_factory(setup.law_context())
         self._layout = setup.layout
-        self._arrays = build_site_arrays(setup)
+        self._arrays = SiteArrays.build(setup)
         self._rate_hz = setup.rate_hz
         self._arrays.site["tau_limit"] = np.inf
         self._arrays.links["alpha"] = shares

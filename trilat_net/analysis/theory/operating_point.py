@@ -23,26 +23,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.arms.exogenous import (
+from ...core import (
     LIVE_KINDS,
     OWN_KINDS,
     SCRIPTED_KINDS,
+    Array,
+    DelayKind,
+    Gains,
+    Scheme,
+    SiteSetup,
+    StaleAction,
     TorqueKind,
     TorqueSource,
+    link_key,
 )
-from ...core.links.delay import DelayKind
-from ...core.links.philox import link_key
-from ...core.step.site_setup import Gains, Scheme, SiteSetup, StaleAction
-from ...core.step.ticks import NS_PER_S
-from ...core.step.vectors import Array
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
-from ...laws.conditions import LinearForm, LinearSituation
-from ...own_code.imported_code import ImportedLaw
-from ...scenario import Scenario
-from ...scenario.delay_models import LinkBase
-from ...scenario.sample_uses import draw_used_samples
-from ...scenario.validate import refuse_external_arms
+from ...laws import LinearForm, LinearSituation
+from ...own_code import ImportedLaw
+from ...records import NS_PER_S
+from ...scenario import LinkBase, Scenario, draw_used_samples, refuse_external_arms
 from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
@@ -99,7 +99,7 @@ class _EffectiveDelay(NamedTuple):
 class OperatingConditions(NamedTuple):
     """The numbers from which the linear model of a loop is built.
 
-    They are those at the end of a run of the scenario, see `derive_operating_conditions`. N is
+    They are those at the end of a run of the scenario, see `OperatingConditions.derive`. N is
     the number of sites.
 
     Attributes:
@@ -215,71 +215,69 @@ class OperatingConditions(NamedTuple):
         pairs = zip(self.sites, arguments, strict=True)
         return [evaluate_site_rates(site, x) for site, x in pairs]
 
+    @classmethod
+    def derive(cls, scenario: Scenario, *, own_laws: bool = True) -> "OperatingConditions":
+        """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
 
-def derive_operating_conditions(
-    scenario: Scenario, *, own_laws: bool = True
-) -> OperatingConditions:
-    """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
+        They are delays, dominance factors, gains and operators, after all planned changes.
 
-    They are delays, dominance factors, gains and operators, after all planned changes.
+        Args:
+            scenario: The description of the experiment.
+            own_laws: True if the code of imported control laws may be executed.
 
-    Args:
-        scenario: The description of the experiment.
-        own_laws: True if the code of imported control laws may be executed.
-
-    Raises:
-        ScenarioError: A law has no linear loop, an arm is not simulated, or the delay of a link
-            is measured during the run.
-    """
-    gains = _find_linear_gains(scenario, own_laws=own_laws)
-    notes: list[str] = []
-    sites = tuple(
-        _select_final_actors(scenario, name, notes)._replace(gains=gains[name])
-        for name in scenario.names
-    )
-
-    alpha = _find_final_dominance(scenario, sites, notes)
-    age_s = np.zeros_like(alpha)
-    laws = scenario.controls
-    sites = tuple(_build_imported_law(scenario, site, alpha) for site in sites)
-    notes += _describe_laws(scenario)
-
-    conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
-    pairs = conditions.coupled_pairs
-    if conditions.has_forms:
-        pairs = list(permutations(range(len(alpha)), 2))
-        notes.append(
-            "a law here has states or waves of its own: "
-            "it is linearised in continuous time only"
+        Raises:
+            ScenarioError: A law has no linear loop, an arm is not simulated, or the delay of a
+                link is measured during the run.
+        """
+        gains = _find_linear_gains(scenario, own_laws=own_laws)
+        notes: list[str] = []
+        sites = tuple(
+            _select_final_actors(scenario, name, notes)._replace(gains=gains[name])
+            for name in scenario.names
         )
 
-    links = {}
-    varying = []
-    for i, j in pairs:
-        peer = scenario.names[j]
-        site = scenario.names[i]
-        link = _find_final_link(scenario, f"{peer}->{site}", notes)
-        links[i, j] = link, link_key(scenario.seed, f"{peer}->{site}")
-        age = compute_effective_delay(scenario, peer, site, link)
-        age_s[i, j] = age.mean_s
-        rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
-        if age.varies or _has_long_period(link, rate_hz):
-            varying.append(age)
+        alpha = _find_final_dominance(scenario, sites, notes)
+        age_s = np.zeros_like(alpha)
+        laws = scenario.controls
+        sites = tuple(_build_imported_law(scenario, site, alpha) for site in sites)
+        notes += _describe_laws(scenario)
 
-    if varying:
-        least_ms = 1e3 * min(age.least_s for age in varying)
-        most_ms = 1e3 * max(age.most_s for age in varying)
-        count = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
-        notes.append(
-            f"the age of the samples in use varies on {count}, "
-            f"{least_ms:.4g} to {most_ms:.4g} ms: the continuous loop is linearised at the "
-            "mean of each, and leaves out the effect of the variation itself"
+        conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
+        pairs = conditions.coupled_pairs
+        if conditions.has_forms:
+            pairs = list(permutations(range(len(alpha)), 2))
+            notes.append(
+                "a law here has states or waves of its own: "
+                "it is linearised in continuous time only"
+            )
+
+        links = {}
+        varying = []
+        for i, j in pairs:
+            peer = scenario.names[j]
+            site = scenario.names[i]
+            link = _find_final_link(scenario, f"{peer}->{site}", notes)
+            links[i, j] = link, link_key(scenario.seed, f"{peer}->{site}")
+            age = compute_effective_delay(scenario, peer, site, link)
+            age_s[i, j] = age.mean_s
+            rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
+            if age.varies or _has_long_period(link, rate_hz):
+                varying.append(age)
+
+        if varying:
+            least_ms = 1e3 * min(age.least_s for age in varying)
+            most_ms = 1e3 * max(age.most_s for age in varying)
+            count = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
+            notes.append(
+                f"the age of the samples in use varies on {count}, "
+                f"{least_ms:.4g} to {most_ms:.4g} ms: the continuous loop is linearised at the "
+                "mean of each, and leaves out the effect of the variation itself"
+            )
+        if any(site.on_stale.action is not StaleAction.USE for site in sites):
+            notes.append("rules for stale peers are left out: no peer counts as stale")
+        return conditions._replace(
+            notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links
         )
-    if any(site.on_stale.action is not StaleAction.USE for site in sites):
-        notes.append("rules for stale peers are left out: no peer counts as stale")
-    return conditions._replace(
-        notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links
-    )
 
 
 def _describe_laws(scenario: Scenario) -> list[str]:

@@ -31,20 +31,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 
-from ...core.arms.exogenous import TorqueKind, TorqueSource
-from ...core.arms.task_space import POSITION
-from ...core.step.site_setup import Law, SiteSetup
-from ...core.step.vectors import Array
+from ...core import POSITION, Array, Law, SiteSetup, TorqueKind, TorqueSource
 from ...errors import UsageError, count_nouns
 from ...results import finite_or_none
-from ...scenario import Scenario
-from ...scenario.arms import TASK_AXES
+from ...scenario import TASK_AXES, Scenario
 from ..arm_rows import build_arm_rows
 from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, compute_delay_spectrum
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .port_passivity import (
     EIGENVALUE_ROUNDING,
     HandMatrices,
@@ -304,7 +300,7 @@ def analyse_ports(
             f"not from {low:g} to {high:g} Hz"
         )
 
-    conditions = derive_operating_conditions(scenario)
+    conditions = OperatingConditions.derive(scenario)
     loop = linearise_teleoperator(conditions, rest)
     other_site = of or scenario.slave
 

@@ -40,7 +40,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.vectors import Array
+from ...core import Array
 from .characteristic_roots import Complex
 from .frequency_search import Minima, find_minima
 from .port_response import PortResponse

@@ -37,7 +37,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.step.vectors import Array
+from ...core import Array
 from ...errors import RuntimeFault, UsageError
 from .characteristic_roots import Complex
 from .linear_loop import DelayedTerm, LinearLoop

@@ -22,9 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.arms.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
-from ...core.step.site_setup import Law, SiteSetup
-from ...core.step.vectors import Array
+from ...core import SCRIPTED_KINDS, Array, Law, SiteSetup, TorqueKind, TorqueSource
 from ..arm_rows import Numbers, PlacedArm, multiply_columns
 from .numeric_law import NumericLaw
 from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints, share_pose

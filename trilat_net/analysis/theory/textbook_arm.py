@@ -43,10 +43,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arms.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint
-from ...core.arms.task_space import POSITION
-from ...core.step.site_setup import ChainSetup, SiteSetup, TaskSetup
-from ...core.step.vectors import Array
+from ...core import (
+    COULOMB_SPEED,
+    LINK_PARAMETERS,
+    POSITION,
+    Array,
+    ChainJoint,
+    ChainSetup,
+    SiteSetup,
+    TaskSetup,
+)
 from ..arm_rows import Numbers, multiply_columns, solve_columns
 from ..following import find_task_reference
 

@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.step.vectors import Array
+from ...core import Array
 
 FLOOR_RAD = 1e-12
 """An envelope below this is the rounding of the numbers, rad; of speeds, rad/s."""

@@ -29,12 +29,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.arms.exogenous import TorqueKind
-from ...core.links.delay import DelayKind
-from ...core.step.ticks import BUCKETS_PER_S
-from ...core.step.vectors import Array
+from ...core import BUCKETS_PER_S, Array, DelayKind, TorqueKind
 from ...errors import NotRepeatable, UsageError, count_nouns
-from ...execution.twins import (
+from ...execution import (
     LEAST_PUSH,
     MOST_PUSH,
     PUSH_RAD,
@@ -42,16 +39,12 @@ from ...execution.twins import (
     Push,
     TwinPath,
     Twins,
-    choose_pushes,
-    parse_push,
-    run_twins,
-    run_virtual_twins,
 )
-from ...log.log_reader import Log, open_log
+from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
 from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
-from ..run_end import RunEnd, classify_log_end, find_coupled_sites
+from ..run_end import RunEnd, find_coupled_sites
 from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 LEAST_LEFT_S = 5.0
@@ -372,60 +365,62 @@ class TwinGrowth(NamedTuple):
             text += f"; a run of {self.needs_s:.3g} s would tell"
         return text
 
+    @classmethod
+    def of_log(
+        cls,
+        log: Log,
+        end: RunEnd,
+        count: int | None = None,
+        *,
+        own_laws: bool = False,
+    ) -> "TwinGrowth":
+        """Repeats a recorded run with small pushes, and judges whether the pushes grow.
 
-def measure_twins(
-    log: Log,
-    end: RunEnd,
-    count: int | None = None,
-    *,
-    own_laws: bool = False,
-) -> TwinGrowth:
-    """Repeats a recorded run with small pushes, and judges whether the pushes grow.
+        Each repetition with a push is called a twin.
 
-    Each repetition with a push is called a twin.
+        Args:
+            log: The log of the run.
+            end: The end of the run, which states from when on the run is judged.
+            count: Number of twins. None for one push of every joint.
+            own_laws: True to run the code of control laws that are not part of this program.
 
-    Args:
-        log: The log of the run.
-        end: The end of the run, which states from when on the run is judged.
-        count: Number of twins. None for one push of every joint.
-        own_laws: True to run the code of control laws that are not part of this program.
+        Returns:
+            The growth of the pushes. If the run cannot be repeated, the result contains no
+            pushes, and the reason.
 
-    Returns:
-        The growth of the pushes. If the run cannot be repeated, the result contains no pushes,
-        and the reason.
+        Raises:
+            LogError: A record cannot be read.
+        """
+        try:
+            twins = Twins.of_log(log, Push.choose(log.scenario, count), own_laws=own_laws)
+        except NotRepeatable as error:
+            return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
+        return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
-    Raises:
-        LogError: A record cannot be read.
-    """
-    try:
-        twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
-    except NotRepeatable as error:
-        return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
-    return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
+    @classmethod
+    def of_scenario(
+        cls,
+        scenario: Scenario,
+        end: RunEnd,
+        duration_s: float,
+        count: int | None = None,
+    ) -> "TwinGrowth":
+        """Simulates a scenario with small pushes, and judges whether the pushes grow.
 
+        This needs no log: the run and its repetitions with a push, the twins, are executed in
+        virtual time.
 
-def measure_virtual_twins(
-    scenario: Scenario,
-    end: RunEnd,
-    duration_s: float,
-    count: int | None = None,
-) -> TwinGrowth:
-    """Simulates a scenario with small pushes, and judges whether the pushes grow.
+        Args:
+            scenario: The description of the experiment.
+            end: The end of the run, which states from when on the run is judged.
+            duration_s: Length of the run, in s.
+            count: Number of twins. None for one push of every joint.
 
-    This needs no log: the run and its repetitions with a push, the twins, are executed in
-    virtual time.
-
-    Args:
-        scenario: The description of the experiment.
-        end: The end of the run, which states from when on the run is judged.
-        duration_s: Length of the run, in s.
-        count: Number of twins. None for one push of every joint.
-
-    Raises:
-        ScenarioError: The scenario cannot run in virtual time.
-    """
-    twins = run_virtual_twins(scenario, choose_pushes(scenario, count), duration_s)
-    return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
+        Raises:
+            ScenarioError: The scenario cannot run in virtual time.
+        """
+        twins = Twins.of_scenario(scenario, Push.choose(scenario, count), duration_s)
+        return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
 def judge_twins(
@@ -922,21 +917,19 @@ def twin(
         target, _ = next(iter(targets), ("q", 0.0))
         sizes = _parse_sizes(delta)
         pushes = [
-            parse_push(scenario, target, size, at_s)._replace(largest=math.inf)
+            Push.parse(scenario, target, size, at_s)._replace(largest=math.inf)
             for size in sizes
         ]
     elif targets:
-        pushes = [parse_push(scenario, target, size, at_s) for target, size in targets]
+        pushes = [Push.parse(scenario, target, size, at_s) for target, size in targets]
     elif is_of_certificate:
-        pushes = choose_pushes(scenario)
-        end = classify_log_end(log)
+        pushes = Push.choose(scenario)
+        end = RunEnd.of_log(log)
         counts_from_s = end.counts_from_s
         quiet_from_s = end.quiet_from_s
     else:
-        pushes = [
-            default._replace(at_s=at_s, again=False) for default in choose_pushes(scenario)
-        ]
-    twins = run_twins(log, pushes, own_laws=True)
+        pushes = [default._replace(at_s=at_s, again=False) for default in Push.choose(scenario)]
+    twins = Twins.of_log(log, pushes, own_laws=True)
     growth = judge_twins(scenario, twins, counts_from_s, quiet_from_s)
     linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
     return PushedTwins(log, at_s, growth, linear)

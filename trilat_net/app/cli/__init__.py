@@ -36,7 +36,7 @@ from ...files import (
     require_libraries,
 )
 from ...package_names import PACKAGE_COMMANDS
-from ...presentation.terminal_output import err, print_error, print_line
+from ...presentation import err, print_error, print_line
 from ...signals import Interrupt
 from . import options, sessions
 from .options import flag

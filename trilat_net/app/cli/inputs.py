@@ -17,8 +17,8 @@ import typer
 
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...files import refuse_existing, write_whole
+from ...presentation import TextTable
 from ...presentation import terminal_output as terminal
-from ...presentation.result_text import TextTable
 from . import options
 from .options import flag, value
 
@@ -68,10 +68,10 @@ def scenario_show_command(
     overrides: options.SetOption = None,
 ) -> None:
     """Prints a scenario in full: every value of every site and link."""
-    from ...scenario.describe import list_arm_notes
+    from ...scenario import list_arm_notes
 
     if name.endswith(".mcap"):
-        from ...log.log_reader import open_log
+        from ...log import open_log
 
         if overrides or duration is not None or seed is not None:
             raise ScenarioError(
@@ -93,8 +93,7 @@ def scenario_check_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Checks a scenario, and prints what its values imply."""
-    from ...scenario.describe import describe_scenario
-    from ...scenario.validate import check_outside_arms
+    from ...scenario import check_outside_arms, describe_scenario
 
     scenario = options.load_chosen_scenario(file, overrides, None, None)
     check_outside_arms(scenario)
@@ -128,7 +127,7 @@ def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[s
         checks: The commands that examine the log of the run, as in "certify {log}", with {log}
             and {file} in place of the names of the log and of the file.
     """
-    from ...scenario.skeletons import name_skeleton_class
+    from ...scenario import name_skeleton_class
 
     file, test = written
     code = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
@@ -149,7 +148,7 @@ def new_law_command(
     force: options.ForceOption = False,
 ) -> None:
     """Creates a working, commented control law to start from, and its test."""
-    from ...scenario.skeletons import new_law
+    from ...scenario import new_law
 
     # A law of a user is settled at best, which is exit code 1 unless it is accepted.
     checks = ("certify {log} --law {file} --accept settled", "report {log} --law {file}")
@@ -162,7 +161,7 @@ def new_hand_command(
     force: options.ForceOption = False,
 ) -> None:
     """Creates a working hand (a program that acts as a user) to start from, and its test."""
-    from ...scenario.skeletons import new_hand
+    from ...scenario import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
     _print_skeleton("hand", new_hand(file, force=force), key, ["report {log}"])
@@ -174,7 +173,7 @@ def new_plant_command(
     force: options.ForceOption = False,
 ) -> None:
     """Creates a working plant (a model of an arm) to start from, and its test."""
-    from ...scenario.skeletons import new_plant
+    from ...scenario import new_plant
 
     _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", ["verify {log}"])
 
@@ -214,7 +213,7 @@ def trace_import_command(
         column: Column of the table that contains the delays; default: the first one with
             a name such as delay, rtt or latency.
     """
-    from ...scenario.delay_traces import import_trace
+    from ...scenario import import_trace
 
     name = file.name.split(".")[0]
     path = out if out is not None else Path(f"{name}-trace.csv")
@@ -256,7 +255,7 @@ def keys_new_command(
         hosts: Host name or address on which a member listens; repeatable. This machine is
             always included.
     """
-    from ...net.member_keys import create_keys
+    from ...net import create_keys
 
     folders = create_keys(folder, members, hosts or (), days)
     for member_folder in folders:
@@ -298,7 +297,7 @@ def keys_add_command(
     machine. Every other member needs its new file members.json, which lists all members, and a
     restart before the next session: until then it refuses what the new members send.
     """
-    from ...net.member_keys import MEMBERS, add_keys
+    from ...net import MEMBERS, add_keys
 
     added = add_keys(folder, members, hosts or (), days)
     for member_folder in added:
@@ -329,7 +328,7 @@ def keys_renew_command(
     Options:
         members: Members whose certificates are renewed; default: all members with a folder.
     """
-    from ...net.member_keys import renew_keys
+    from ...net import renew_keys
 
     for member_folder in renew_keys(folder, members or (), days):
         terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
@@ -349,7 +348,7 @@ def keys_pair_command(
     Keep NAME.key private. Give NAME.pub to everybody who checks your logs, over a channel that
     they trust.
     """
-    from ...log.log_signature import create_signing_keys
+    from ...log import create_signing_keys
 
     private, public = create_signing_keys(name)
     terminal.print_text(f"{private}: signs, as in: trilat log sign run.mcap --key {private}")
@@ -363,8 +362,7 @@ def keys_info_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Shows whose keys they are, until when and where they hold, and what they permit."""
-    from ...net.member_keys import read_member_keys
-    from ...net.zenoh_config import ROLES, ROUTER, describe_role
+    from ...net import ROLES, ROUTER, describe_role, read_member_keys
 
     if rules and as_json:
         raise UsageError("--rules and --json cannot be combined: --json contains the rules")

@@ -17,8 +17,8 @@ import typer
 
 from ...entry_points import find_viewer
 from ...errors import UsageError, count_nouns
+from ...presentation import list_export_formats
 from ...presentation import terminal_output as terminal
-from ...presentation.exports import list_export_formats
 from . import options
 
 _LOSSY_EXIT_CODE = 3
@@ -28,7 +28,7 @@ _LOSSY_EXIT_CODE = 3
 @options.command("run.mcap", page="docs/logs/log-tools.md")
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
-    from ...analysis.file_overview import info
+    from ...analysis import info
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         overview = info(*files, progress=progress)
@@ -51,12 +51,12 @@ def log_check_command(
     Exit code 0: the log is sound. 1: the log is not sound. 2: the file does not exist. For
     files from other programs, only the structure is checked.
     """
-    from ...log.session_check import check_file
+    from ...log import check_file
 
     with terminal.progress_bar(f"checking {files[0]}") as progress:
         check = check_file(*files, progress=progress)
     if key is not None:
-        from ...log.log_signature import check_signatures
+        from ...log import check_signatures
 
         with terminal.progress_bar(f"checking the signature of {files[0]}") as progress:
             check.findings.append(check_signatures(files, key, progress))
@@ -85,7 +85,7 @@ def log_sign_command(
     The signature covers the digest chain: all messages and everything that describes them.
     Check it with the public key: trilat log check FILE --key PUB
     """
-    from ...log.log_signature import sign_log
+    from ...log import sign_log
 
     with terminal.progress_bar(f"reading {file}") as progress:
         signature = sign_log(file, key, force=force, progress=progress)
@@ -115,7 +115,7 @@ def log_recover_command(
     The original file is not changed. The command works with every MCAP file. Exit code 0:
     nothing was lost. 3: something was lost, and is listed. 1: nothing could be recovered.
     """
-    from ...log.recover import recover
+    from ...log import recover
 
     with terminal.progress_bar(f"reading {file}") as progress:
         result = recover(file, output, force=force, progress=progress)
@@ -157,8 +157,8 @@ def log_export_command(
             that the sites exchange.
         output: File or folder to write; default: next to FILE, with a name derived from it.
     """
-    from ...log.log_reader import open_logs
-    from ...presentation.export import Exporter
+    from ...log import open_logs
+    from ...presentation import Exporter
 
     pairs = [text.partition("=") for text in settings or []]
     format_settings = {key: value for key, _, value in pairs}
@@ -227,7 +227,7 @@ def log_view_command(
     from importlib.util import find_spec
 
     from ...files import stage_output
-    from ...presentation.rerun_viewer import ViewerOptions, open_rerun
+    from ...presentation import ViewerOptions, open_rerun
 
     if viewer is not None:
         if full or web or save or foxglove or rviz or force:
@@ -265,7 +265,7 @@ def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) 
         rviz: True to write a configuration of RViz.
         force: True to replace existing files.
     """
-    from ...presentation.viewer_files import write_foxglove_layout, write_rviz_config
+    from ...presentation import write_foxglove_layout, write_rviz_config
 
     if foxglove:
         layout = write_foxglove_layout(file, force=force)
@@ -293,13 +293,9 @@ def _open_page(files: list[Path]) -> None:
     import webbrowser
     from contextlib import suppress
 
-    from ...files import (
-        choose_report_folder,
-        format_extra_install,
-        make_results_folder,
-        refuse_link,
-    )
-    from ...presentation.conclude import conclude
+    from ...files import format_extra_install, make_results_folder, refuse_link
+    from ...presentation import conclude
+    from ..api import choose_report_folder
 
     terminal.print_note(
         f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ...errors import CodeWithheld, RunFailed, UsageError, count_nouns
-from ...net.clock import Clock, SystemClock, make_system_clock
+from ...net import Clock, SystemClock, make_system_clock
+from ...presentation import TextTable
 from ...presentation import terminal_output as terminal
-from ...presentation.result_text import TextTable
 from ...signals import Interrupt
 from . import options
 from .options import flag, seconds, value
@@ -75,10 +75,9 @@ def site_command(
         leave_timeout: Longest time to continue after another site has left, if the arms then
             glide (on_stale.action = "glide"), s; default: until the end of the run.
     """
-    from sites.site_parts import SiteOptions
-    from sites.site_process import run_site
+    from sites import SiteOptions, run_site
 
-    from ...net.connection import default_endpoints
+    from ...net import default_endpoints
     from ...scenario import find_site
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -178,16 +177,14 @@ def record_command(
         split_duration: Split the log into parts of this duration, s.
         durable: Sync to the disk at every flush instead of every second.
     """
-    from recorder.record_process import record_session
-    from sites.machine_load import check_machine_load
+    from recorder import record_session
+    from sites import check_machine_load
 
     from ...files import refuse_existing
-    from ...log.log_layout import find_parts, parse_channel_filter
-    from ...log.log_writer import LogStorage, parse_split
-    from ...log.provenance import collect_provenance
-    from ...log.view_rates import parse_viz_rate
-    from ...net.topics import RECORDER
+    from ...log import ChannelFilter, LogStorage, collect_provenance, find_parts
+    from ...net import RECORDER
     from ..recorded_session import make_scenario_reader
+    from .options import parse_viz_rate
 
     options.check_session_name(session)
     connection = ways.resolve().require(RECORDER)
@@ -199,7 +196,7 @@ def record_command(
         split_bytes=parse_split("--split-size", "MiB", split_size, 1 << 20),
         split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
         carry_on=carry_on,
-        choice=parse_channel_filter(include or [], exclude or []),
+        choice=ChannelFilter.parse(include or [], exclude or []),
     )
     read_scenario = make_scenario_reader(parse_viz_rate(views))
 
@@ -282,7 +279,7 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
             could not be verified completely.
         RunFailed: The log failed a check, or the session ended with a failure.
     """
-    from ...presentation.conclude import conclude_files
+    from ...presentation import conclude_files
 
     log, conclusion = conclude_files(parts, parts[0].parent, png=png)
     if conclusion.exit_code == CodeWithheld.exit_code:
@@ -354,7 +351,7 @@ def replay_command(
     from trilat_net.app.play.player import parse_rate
     from trilat_net.app.play.session_reader import parse_selection, preload_messages
 
-    from ...net.connection import default_endpoint
+    from ...net import default_endpoint
 
     if preload < 0:
         raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
@@ -432,7 +429,7 @@ def _announce_playback(
         rate: Speed relative to the recording. Infinity for as fast as possible.
         print_line: Function that prints a line.
     """
-    from ...net.messages import VERSION
+    from ...net import VERSION
 
     speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
     sites = ", ".join(header.boots)
@@ -639,18 +636,11 @@ def router_command(
     router is restarted. Routers that are connected to each other with --connect act as one
     router.
     """
-    from ...net.connection import (
-        open_bus,
-        resolve_member_connection,
-        run_router,
-        secure_connection,
-    )
-    from ...net.zenoh_bus import read_zenoh_file
-    from ...net.zenoh_config import ROUTER
+    from ...net import ROUTER, Connection, read_zenoh_file, run_router
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     default_listen = [LOOPBACK if keys is None else ANY_ADDRESS]
-    open_connection = resolve_member_connection(
+    open_connection = Connection.of_member(
         listen=listen,
         connect=connect,
         routers=None,
@@ -659,7 +649,7 @@ def router_command(
         connect_else=(),
         routes=True,
     )
-    secured = secure_connection(open_connection, keys, insecure=insecure)
+    secured = open_connection.secure(keys, insecure=insecure)
     connection = secured.require(ROUTER)
     expiry = connection.describe_end()
     if expiry:
@@ -667,8 +657,7 @@ def router_command(
 
     clock = SystemClock()
     with Interrupt() as interrupt:
-        bus = open_bus(
-            connection=connection,
+        bus = connection.open_bus(
             clock=clock,
             stopped=interrupt.is_requested,
             timeout_s=None,
@@ -692,3 +681,25 @@ def router_command(
 def _print_router_line(text: str) -> None:
     """Prints a line that starts with "router:"."""
     terminal.print_line(f"router: {text}")
+
+
+def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
+    """Parses an option of a command that limits the parts of a log.
+
+    Args:
+        option: Name of the option, for the error message.
+        unit: Name of the option's unit, for the error message.
+        number: Value of the option. None if the option is absent.
+        scale: Bytes or ns per unit.
+
+    Returns:
+        The limit in bytes or ns. None if the option is absent.
+
+    Raises:
+        UsageError: The number is not from 1 to 1e6.
+    """
+    if number is None:
+        return None
+    if not 1.0 <= number <= 1e6:
+        raise UsageError(f"{option} must be a number of {unit} from 1 to 1e6, not {number:g}")
+    return int(number * scale)

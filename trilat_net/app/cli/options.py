@@ -7,6 +7,7 @@ A command that has a parameter of such a type accepts all options of the type
 """
 
 import inspect
+import math
 import re
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -18,11 +19,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import typer
 
 from ...errors import TrilatError, UsageError
+from ...log import FULL_RATE_HZ
 from ...presentation import terminal_output as terminal
 
 if TYPE_CHECKING:
-    from ...log.log_reader import Log
-    from ...net.connection import Connection
+    from ...log import Log
+    from ...net import Connection
     from ...results import Result
     from ...scenario import Scenario
 
@@ -174,7 +176,7 @@ def complete_figures(incomplete: str) -> list[str]:
     Args:
         incomplete: The letters before the completion.
     """
-    from ...presentation.figures.registry import FIGURES
+    from ...presentation import FIGURES
 
     return [name for name in FIGURES if name.startswith(incomplete)]
 
@@ -189,7 +191,7 @@ def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
     Returns:
         The names. Empty if the command line has no valid scenario or log yet.
     """
-    from ...log.log_reader import open_log
+    from ...log import open_log
     from ...scenario import load_scenario
 
     files = context.params.get("files") or []
@@ -441,7 +443,7 @@ def check_picture(path: Path | None, *, force: bool) -> None:
     if path is None:
         return
     from ...files import refuse_existing
-    from ...presentation.style import FIGURE_FORMATS
+    from ...presentation import FIGURE_FORMATS
 
     if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
         raise UsageError(
@@ -468,7 +470,7 @@ def print_and_draw(
         as_json: True to print the result as JSON.
     """
     if picture is not None:
-        from ...presentation.style import REPORT_DPI, write_figure
+        from ...presentation import REPORT_DPI, write_figure
 
         module_name, _, function_name = figure.partition(":")
         module = import_module(f"trilat_net.presentation.figures.{module_name}")
@@ -590,11 +592,10 @@ class MemberOptions(NamedTuple):
             listen_else: Addresses at which to listen if the options state none.
             connect_else: Addresses to which to connect if the options state none.
         """
-        from ...net.connection import resolve_member_connection
-        from ...net.zenoh_bus import read_zenoh_file
+        from ...net import Connection, read_zenoh_file
 
         file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
-        return resolve_member_connection(
+        return Connection.of_member(
             listen=self.listen,
             connect=self.connect,
             routers=self.router,
@@ -620,15 +621,13 @@ class MemberOptions(NamedTuple):
             stops: True if the connection only serves to stop arms. Expired keys are then
                 accepted, and no note is printed.
         """
-        from ...net.connection import secure_connection
-
         connection = self.find_endpoints(listen_else, connect_else)
         keys: Any = self.keys
         if stops and keys is not None:
-            from ...net.member_keys import read_member_keys
+            from ...net import read_member_keys
 
             keys = read_member_keys(keys, stops=True)
-        secured = secure_connection(connection, keys, insecure=self.insecure)
+        secured = connection.secure(keys, insecure=self.insecure)
         expiry = secured.describe_end()
         # A user who stops an arm in a hurry does not read notes.
         if expiry and not stops:
@@ -658,7 +657,7 @@ class Reach(NamedTuple):
                 other keys are refused.
             stops: True if the command only stops arms. Then expired keys are accepted too.
         """
-        from ...net.zenoh_config import OPERATOR
+        from ...net import OPERATOR
 
         connection = MemberOptions(None, *self).resolve(stops=stops)
         return connection.require(OPERATOR) if operates else connection
@@ -789,3 +788,30 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
         parameter.name: parameter.annotation for parameter in parameters
     }
     return run_with_tuples
+
+
+def parse_viz_rate(text: str) -> float:
+    """Parses the option `--views`, the rate of the messages for viewers such as Foxglove.
+
+    Args:
+        text: A number from 1 to 1e6, "off" or "full".
+
+    Returns:
+        The rate in Hz. It is 0 for "off" and `FULL_RATE_HZ` for "full".
+
+    Raises:
+        UsageError: The text is neither a number in range nor one of these words.
+    """
+    keywords = {"off": 0.0, "full": FULL_RATE_HZ}
+    if text in keywords:
+        return keywords[text]
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = math.nan
+    if not 1.0 <= rate_hz <= 1e6:
+        raise UsageError(
+            "--views must be off, full, or a number of messages per second from 1 to 1000000, "
+            f"not {text!r}"
+        )
+    return rate_hz

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from ...errors import format_wall_time
-from ...net.clock import SystemClock
+from ...net import SystemClock
 from ...presentation import terminal_output as terminal
 
 if TYPE_CHECKING:

@@ -15,14 +15,14 @@ import typer
 from rich.markup import escape
 
 from ...errors import ScenarioError, UsageError
+from ...presentation import TextTable
 from ...presentation import terminal_output as terminal
-from ...presentation.result_text import TextTable
 from ...signals import Interrupt
 from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from ...log.log_reader import Log
+    from ...log import Log
     from ...scenario import Scenario
 
 
@@ -45,10 +45,10 @@ def sim_command(
 
     It writes the same kind of log as a live session.
     """
-    from ...execution.virtual import record_virtual
-    from ...log.view_rates import parse_viz_rate
-    from ...own_code.code_consent import find_user_laws
-    from ...scenario.validate import write_simulated_options
+    from ...execution import record_virtual
+    from ...own_code import find_user_laws
+    from ...scenario import write_simulated_options
+    from .options import parse_viz_rate
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     if chosen.outside:
@@ -82,7 +82,7 @@ def sim_command(
         )
         raise typer.Exit(interrupt.exit_code)
 
-    from ...log.log_reader import open_log
+    from ...log import open_log
 
     if as_json:
         terminal.print_json(open_log(path).to_dict())
@@ -112,7 +112,7 @@ def _describe_length(scenario: "Scenario", path: Path) -> str:
         scenario: Scenario of the run.
         path: The log of the run.
     """
-    from ...log.log_reader import open_log
+    from ...log import open_log
 
     sites = ", ".join(scenario.names)
     diverged_s = open_log(path).diverged_s
@@ -147,11 +147,11 @@ def verify_command(
         resume_every: Restart each site from its records every N ticks (control periods), to
             reveal state of a control law that the records lack; default 0: never.
     """
-    from ...execution.log_checks import run_log_checks
+    from ...execution import LogCheckReport
 
     log = laws.open(*files)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
-        result = run_log_checks(
+        result = LogCheckReport.of_log(
             log,
             virtual=virtual,
             progress=progress,
@@ -224,8 +224,8 @@ def certify_command(
     stable. 1: settled, not stable (bounded oscillation, drifting, growing, diverged) or open.
     2: there is no log, or no site has a record in it.
     """
-    from ...analysis.judge import certify_run
-    from ...presentation.citation import compose_citation
+    from ...analysis import certify_run
+    from ...presentation import compose_citation
 
     own_laws = own_laws or bool(laws.law)
     log = laws.open(*files, runs_them=own_laws)
@@ -286,7 +286,7 @@ def twin_command(
     without a linear model (docs/logs/twins.md). The exit code is 0 whether or not the
     disturbances grow.
     """
-    from ...analysis.twins.twin_growth import twin
+    from ...analysis import twin
 
     options.check_picture(picture, force=force)
     log = laws.open(*files)
@@ -311,7 +311,7 @@ def metrics_command(
     missing value; if the run could have the value, the reason is given.
     docs/reference/metrics.md has every formula.
     """
-    from ...analysis.metrics.log_metrics import compute_log_metrics
+    from ...analysis import compute_log_metrics
 
     log = terminal.open_with_progress(*file)
     log.require_records()
@@ -357,7 +357,7 @@ def figure_command(
         _list_figures(log, as_json=as_json)
         return
     from ...files import refuse_link
-    from ...presentation.figures.registry import write_figures, write_overlay
+    from ...presentation import write_figures, write_overlay
 
     out = folder
     if out is None:
@@ -395,7 +395,7 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
         log: The log.
         as_json: True to print the list as JSON.
     """
-    from ...presentation.figures.registry import FIGURES
+    from ...presentation import FIGURES
 
     # The reason is empty if the log has what the figure needs.
     reasons = {name: figure.absent(log) for name, figure in FIGURES.items()}
@@ -436,8 +436,9 @@ def report_command(
 
     A summary is written beside the page, and with --png also the figures.
     """
-    from ...files import choose_report_folder, make_results_folder, refuse_link
-    from ...presentation.conclude import conclude
+    from ...files import make_results_folder, refuse_link
+    from ...presentation import conclude
+    from ..api import choose_report_folder
 
     log = laws.open(*files)  # so that no folder is created for a log that cannot be read
     log.require_records()
@@ -484,9 +485,9 @@ def rerun_command(
     --replace names are executed again. The other sites repeat what was recorded, and do not
     react.
     """
-    from ...execution.rerun import rerun
+    from ...execution import rerun
     from ...files import refuse_existing
-    from ...log.log_layout import active_path
+    from ...log import active_path
 
     if output is not None:
         is_input = any(
@@ -572,8 +573,7 @@ def linear_command(
     verdict.
     """
     options.check_picture(picture, force=force)
-    from ...analysis.theory.hand_files import read_hands
-    from ...analysis.theory.linear_analysis import analyse_linear_loop
+    from ...analysis import analyse_linear_loop, read_hands
 
     draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
     hands = read_hands(operators or [])

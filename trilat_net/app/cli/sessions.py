@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import typer
 
 from ...errors import UsageError
-from ...net.clock import SystemClock, make_system_clock
+from ...net import SystemClock, make_system_clock
+from ...presentation import MARKS
 from ...presentation import terminal_output as terminal
-from ...presentation.result_text import MARKS
 from ...signals import Interrupt
 from . import options
 from .options import flag, value
@@ -68,7 +68,7 @@ def _describe_log(path: Path) -> str:
         A text that starts with a colon. Empty if the log cannot be read.
     """
     from ...errors import LogError
-    from ...log.log_reader import open_log
+    from ...log import open_log
 
     with suppress(LogError):
         # The headline names the session first, which the user knows.
@@ -118,7 +118,7 @@ def run_and_report(
         raise typer.Exit(outcome.exit_code)
 
     # imported after the session, whose start it would delay
-    from ...presentation.conclude import conclude_files
+    from ...presentation import conclude_files
 
     _, conclusion = conclude_files([outcome.log], results, as_json=run.as_json, png=run.png)
     if page is not None:
@@ -340,9 +340,7 @@ def _ping_topic(
     """
     from trilat_net.app.session_ping import ping_topic
 
-    from ...net.ros2_graph import ROUTER_ADVICE, Refusals, Ros2Graph
-    from ...net.ros2_names import check_ros_name
-    from ...net.zenoh_bus import RouterSilent
+    from ...net import ROUTER_ADVICE, Refusals, Ros2Graph, RouterSilent, check_ros_name
 
     name = check_ros_name(topic, "topic")
     clock = SystemClock()
@@ -525,7 +523,7 @@ def _parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
     Raises:
         UsageError: A text is not of that form.
     """
-    from ...scenario.override import split_assignment
+    from ...scenario import split_assignment
 
     pairs = []
     for text in texts:
@@ -633,8 +631,8 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     """
     from trilat_net.app.running_session import RunningSession
 
-    from ...net.requests import ChangeRequest
-    from ...scenario.key_checks import check_finite
+    from ...net import ChangeRequest
+    from ...scenario import check_finite
 
     session, connection = context.obj
     check_finite(change, "")  # messages cannot hold infinite numbers

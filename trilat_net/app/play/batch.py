@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from trilat_net.log.record_columns import Ints
+from ...log import Ints
 
 PlayedMessage = tuple[int, int, int, bytes]
 """A message: time after the start of the session in ns, number of the channel, number of the

@@ -19,12 +19,9 @@ from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection
-from trilat_net.net.discovery import open_playback_bus, refuse_running_session
 from trilat_net.records import NS_PER_S
 
+from ...net import Bus, Clock, Connection, open_playback_bus, refuse_running_session
 from .batch import MessageBatch
 from .message_source import MessageSource
 from .player import LatenessSummary, Pace, Player, PlayProgress

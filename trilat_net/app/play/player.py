@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trilat_net.errors import UsageError
-from trilat_net.net.clock import Clock
 
+from ...net import Clock
 from .batch import MessageBatch
 from .message_source import MessageSource
 from .site_stand_ins import PlayedHistory

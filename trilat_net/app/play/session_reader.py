@@ -24,20 +24,21 @@ import msgspec
 from trilat_net import process
 from trilat_net.errors import LogError, ScenarioError, UsageError, count_nouns
 from trilat_net.files import reading
-from trilat_net.log.log_layout import (
+from trilat_net.net import topics
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Scenario, parse_embedded
+
+from ...log import (
     ALL_CHANNELS,
     SCENARIO,
     SESSION,
     SITE_CHANNELS,
     ChannelFilter,
-    parse_channel_filter,
+    McapMessage,
+    McapReader,
+    Progress,
 )
-from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
-from trilat_net.net import topics
-from trilat_net.net.topics import number_message
-from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, parse_embedded
-
+from ...net import number_message
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 
 PlayTime = Literal["publish", "log"]
@@ -128,7 +129,7 @@ def parse_selection(
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
     return PlaySelection(
-        channels=parse_channel_filter(include, exclude),
+        channels=ChannelFilter.parse(include, exclude),
         start_ns=None if start_s is None else round(start_s * NS_PER_S),
         stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
         time=cast(PlayTime, time),

@@ -27,21 +27,26 @@ import msgspec
 import numpy as np
 
 from trilat_net.errors import WireError
-from trilat_net.log.record_columns import Ints
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Query
-from trilat_net.net.clock import Clock
-from trilat_net.net.membership import (
+
+from ...log import Ints
+from ...net import (
+    BACKFILL_BYTES,
+    BACKFILL_MESSAGES,
+    BackfillRequest,
+    Bus,
+    Clock,
+    Event,
     MemberQuery,
+    Query,
+    answer_backfill,
+    answer_pings,
+    decode,
     describe_member,
+    encode,
     liveliness_token,
     read_messages,
 )
-from trilat_net.net.messages import Event
-from trilat_net.net.pinging import answer_backfill, answer_pings
-from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
-from trilat_net.net.wire import decode, encode
-
 from .batch import MessageBatch
 from .session_reader import NUMBERS_OF_A_START, SessionHeader
 

@@ -34,30 +34,6 @@ from .lost_peers import regroup
 ROW_SUM_TOLERANCE = 1e-9
 
 
-def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
-
-    The row contains the weights with which one site follows the others. They must lie between 0
-    and 1 and sum to 1, and the site must not follow itself.
-
-    Args:
-        row: Dominance factors of one site, shape (N,).
-        site: Index of that site.
-
-    Returns:
-        A clause for an error message. None if the row is valid.
-    """
-    if not np.isfinite(row).all():
-        return "shares must be finite numbers"
-    if row[site] != 0.0:
-        return f"a site does not follow itself, yet its own share is {row[site]:g}"
-    if (row < 0.0).any() or (row > 1.0).any():
-        return "shares must lie between 0 and 1"
-    if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
-        return f"shares must sum to 1, Eq. (7), and sum to {row.sum():.12g}"
-    return None
-
-
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
     """Returns which sites each site follows, directly or through other sites.
 

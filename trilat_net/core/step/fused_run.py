@@ -706,7 +706,7 @@ def run_until(
         peaks: Per bucket the largest |e| of each joint, then the largest |qd| of each joint,
             then the last q of each joint; -1 where there is no record; shape (N, buckets, 3 n).
         sums: The sums of the sites, shape (N,), see `sums_dtype`.
-        arrays: The arrays of all sites, see `stack_site_arrays`.
+        arrays: The arrays of all sites, see `SiteArrays.stack`.
         chains: Its `chain` once more: as an argument that is None it keeps Numba from compiling
             the leaves of chains.
         laws: The users' compiled laws. None if there are none.

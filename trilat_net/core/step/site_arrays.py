@@ -99,6 +99,146 @@ class SiteArrays(NamedTuple):
     chain: RowArray | None
     channel: ChannelArrays | None
 
+    @classmethod
+    def build(
+        cls,
+        setup: SiteSetup,
+        spare: tuple[int, int] = (0, 0),
+        pages: int = 0,
+        layout: Layout | None = None,
+        *,
+        plugged: bool = False,
+    ) -> "SiteArrays":
+        """Creates the arrays of a site (the process of one arm) before its first period.
+
+        Args:
+            setup: Setup of the site.
+            spare: Two numbers of free rows for changes during the run: for changes of each
+                link's delay model, and for changes of the weights with which the site follows
+                the other sites.
+            pages: Number of samples that can wait on each link, which is also the number of
+                delivery times that each link stores. 0 to derive both numbers from the setup.
+            layout: Lengths of the vectors in the arrays, if they are larger than this site
+                needs.
+            plugged: True to include the arrays of a user's control law, even if this site has
+                none.
+        """
+        links = setup.links
+        layout = layout or setup.layout
+        peers = len(links)
+        spare_models, spare_ramps = spare
+        kept_dues = pages or _count_kept_dues(setup)
+        pages = pages or needed_pages(setup)
+        calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
+        calendars["tick"] = -1
+        rows, models, points = _build_links(links, spare_models, layout.shared)
+        axes = 3 if layout.chain else 2
+        actors, table = torque_source_rows(setup.actors, layout.joints, axes)
+        ramp_count = 1 + len(setup.ramps) + spare_ramps
+        ramps = np.zeros((ramp_count, RAMP_COLUMNS + peers))
+        ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
+        chain = None
+        if setup.chain is not None:
+            chain = build_chain(setup.chain.joints, layout.joints)
+        has_channel = plugged or setup.law_factory is not None
+        arrays = SiteArrays(
+            site=_build_site(setup, layout),
+            links=rows,
+            models=models,
+            dues=np.full((peers, kept_dues), LOST, dtype=np.int64),
+            calendars=calendars,
+            points=points,
+            ramps=ramps,
+            actors=actors,
+            table=table,
+            chain=chain,
+            channel=_build_channel(setup, pages) if has_channel else None,
+        )
+        for ramp in setup.ramps:
+            _add_ramp(arrays, ramp)
+        return arrays
+
+    @classmethod
+    def stack(
+        cls, setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
+    ) -> "SiteArrays":
+        """Creates the arrays for a simulation of several sites, stacked along a first axis.
+
+        A site is a process that runs one arm. If the arrays of a site are shorter than those of
+        another site, they are filled up with rows that are never read. The ring buffers for
+        delayed samples (states of other sites) are long enough for all delays.
+
+        Args:
+            setups: Setups of the sites.
+            spare: Number of changes during the run for which there is room, for each link and
+                for the weights with which each site follows the others.
+            longest_us: Longest delay that the changes can lead to, us.
+            late_ns: Longest time by which a sample may arrive after its delivery time, ns.
+        """
+        for setup in setups:
+            for link in setup.links:
+                longest_us = max(longest_us, max_delay_us(link.models, link.traces))
+        fastest_hz = max(setup.rate_hz for setup in setups)
+        margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
+        pages = calendar_pages(fastest_hz, longest_us, margin_ns)
+        layouts = [setup.layout for setup in setups]
+        lengths_by_field = zip(*layouts, strict=True)
+        largest = Layout(*map(max, lengths_by_field))
+        plugged = any(setup.law_factory is not None for setup in setups)
+        sites = [
+            SiteArrays.build(setup, (spare, spare), pages, largest, plugged=plugged)
+            for setup in setups
+        ]
+        _share_tables(sites)
+        actors = _stack_padded([site.actors for site in sites])
+        for row, site in zip(actors, sites, strict=True):
+            row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
+        chains = [site.chain for site in sites if site.chain is not None]
+        channels = [site.channel for site in sites if site.channel is not None]
+        return SiteArrays(
+            site=_stack_padded([site.site for site in sites]),
+            links=_stack_padded([site.links for site in sites]),
+            models=_stack_padded([site.models for site in sites]),
+            dues=_stack_padded([site.dues for site in sites]),
+            calendars=_stack_padded([site.calendars for site in sites]),
+            points=np.concatenate([site.points for site in sites]),
+            ramps=_stack_padded([site.ramps for site in sites]),
+            actors=actors,
+            table=np.concatenate([site.table for site in sites]),
+            chain=_stack_padded(chains) if largest.chain else None,
+            channel=_stack_channels(setups, channels) if channels else None,
+        )
+
+    def select(self, i: int, layout: Layout) -> "SiteArrays":
+        """Returns the arrays of one site of several stacked sites, as views.
+
+        The rows may be longer than the site's layout.
+
+        Args:
+            i: Index of the site.
+            layout: Layout of the site.
+        """
+        channel = self.channel
+        if channel is not None:
+            waiting = channel.waiting[i]
+            received = channel.received[i]
+            columns = channel.columns[i]
+            channel = ChannelArrays(waiting, received, columns)
+        chain = self.chain
+        if chain is not None:
+            chain = chain[i, : layout.joints]
+        return self._replace(
+            site=self.site[i],
+            links=self.links[i],
+            models=self.models[i],
+            dues=self.dues[i],
+            calendars=self.calendars[i],
+            ramps=self.ramps[i],
+            actors=self.actors[i],
+            chain=chain,
+            channel=channel,
+        )
+
 
 class TickBuffers(NamedTuple):
     """Input and output of one period of the control loop.
@@ -140,62 +280,6 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
         sent=np.zeros((MAX_ARRIVALS, largest_received)),
         record=np.zeros(layout.floats),
     )
-
-
-def build_site_arrays(
-    setup: SiteSetup,
-    spare: tuple[int, int] = (0, 0),
-    pages: int = 0,
-    layout: Layout | None = None,
-    *,
-    plugged: bool = False,
-) -> SiteArrays:
-    """Creates the arrays of a site (the process of one arm) before its first control period.
-
-    Args:
-        setup: Setup of the site.
-        spare: Two numbers of free rows for changes during the run: for changes of each link's
-            delay model, and for changes of the weights with which the site follows the other
-            sites.
-        pages: Number of samples that can wait on each link, which is also the number of
-            delivery times that each link stores. 0 to derive both numbers from the setup.
-        layout: Lengths of the vectors in the arrays, if they are larger than this site needs.
-        plugged: True to include the arrays of a user's control law, even if this site has none.
-    """
-    links = setup.links
-    layout = layout or setup.layout
-    peers = len(links)
-    spare_models, spare_ramps = spare
-    kept_dues = pages or _count_kept_dues(setup)
-    pages = pages or needed_pages(setup)
-    calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
-    calendars["tick"] = -1
-    rows, models, points = _build_links(links, spare_models, layout.shared)
-    axes = 3 if layout.chain else 2
-    actors, table = torque_source_rows(setup.actors, layout.joints, axes)
-    ramp_count = 1 + len(setup.ramps) + spare_ramps
-    ramps = np.zeros((ramp_count, RAMP_COLUMNS + peers))
-    ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
-    chain = None
-    if setup.chain is not None:
-        chain = build_chain(setup.chain.joints, layout.joints)
-    has_channel = plugged or setup.law_factory is not None
-    arrays = SiteArrays(
-        site=_build_site(setup, layout),
-        links=rows,
-        models=models,
-        dues=np.full((peers, kept_dues), LOST, dtype=np.int64),
-        calendars=calendars,
-        points=points,
-        ramps=ramps,
-        actors=actors,
-        table=table,
-        chain=chain,
-        channel=_build_channel(setup, pages) if has_channel else None,
-    )
-    for ramp in setup.ramps:
-        _add_ramp(arrays, ramp)
-    return arrays
 
 
 def needed_pages(setup: SiteSetup) -> int:
@@ -489,62 +573,11 @@ _NEVER_SAMPLED = 2
 """Marks an actor that only fills up a stack: it is evaluated neither per stage nor per tick."""
 
 
-def stack_site_arrays(
-    setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
-) -> SiteArrays:
-    """Creates the arrays for a simulation of several sites, stacked along a first axis.
-
-    A site is a process that runs one arm. If the arrays of a site are shorter than those of
-    another site, they are filled up with rows that are never read. The ring buffers for delayed
-    samples (states of other sites) are long enough for all delays.
-
-    Args:
-        setups: Setups of the sites.
-        spare: Number of changes during the run for which there is room, for each link and for
-            the weights with which each site follows the others.
-        longest_us: Longest delay that the changes can lead to, us.
-        late_ns: Longest time by which a sample may arrive after its delivery time, ns.
-    """
-    for setup in setups:
-        for link in setup.links:
-            longest_us = max(longest_us, max_delay_us(link.models, link.traces))
-    fastest_hz = max(setup.rate_hz for setup in setups)
-    margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
-    pages = calendar_pages(fastest_hz, longest_us, margin_ns)
-    layouts = [setup.layout for setup in setups]
-    lengths_by_field = zip(*layouts, strict=True)
-    largest = Layout(*map(max, lengths_by_field))
-    plugged = any(setup.law_factory is not None for setup in setups)
-    sites = [
-        build_site_arrays(setup, (spare, spare), pages, largest, plugged=plugged)
-        for setup in setups
-    ]
-    _share_tables(sites)
-    actors = _stack_padded([site.actors for site in sites])
-    for row, site in zip(actors, sites, strict=True):
-        row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
-    chains = [site.chain for site in sites if site.chain is not None]
-    channels = [site.channel for site in sites if site.channel is not None]
-    return SiteArrays(
-        site=_stack_padded([site.site for site in sites]),
-        links=_stack_padded([site.links for site in sites]),
-        models=_stack_padded([site.models for site in sites]),
-        dues=_stack_padded([site.dues for site in sites]),
-        calendars=_stack_padded([site.calendars for site in sites]),
-        points=np.concatenate([site.points for site in sites]),
-        ramps=_stack_padded([site.ramps for site in sites]),
-        actors=actors,
-        table=np.concatenate([site.table for site in sites]),
-        chain=_stack_padded(chains) if largest.chain else None,
-        channel=_stack_channels(setups, channels) if channels else None,
-    )
-
-
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
     """Adds to each site's indices the place of its rows in the joined tables of all sites.
 
     The points of delay traces and outages and the torques of operators lie in two tables per
-    site. `stack_site_arrays` joins the tables of all sites, so the rows of the second site
+    site. `SiteArrays.stack` joins the tables of all sites, so the rows of the second site
     begin after those of the first.
 
     Args:
@@ -559,38 +592,6 @@ def _share_tables(sites: Sequence[SiteArrays]) -> None:
         site.actors["table_first"] += first_torque
         first_point += len(site.points)
         first_torque += len(site.table)
-
-
-def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
-    """Returns the arrays of one site of several stacked sites, as views.
-
-    The rows may be longer than the site's layout.
-
-    Args:
-        stacked: Arrays of all sites, see `stack_site_arrays`.
-        i: Index of the site.
-        layout: Layout of the site.
-    """
-    channel = stacked.channel
-    if channel is not None:
-        waiting = channel.waiting[i]
-        received = channel.received[i]
-        columns = channel.columns[i]
-        channel = ChannelArrays(waiting, received, columns)
-    chain = stacked.chain
-    if chain is not None:
-        chain = chain[i, : layout.joints]
-    return stacked._replace(
-        site=stacked.site[i],
-        links=stacked.links[i],
-        models=stacked.models[i],
-        dues=stacked.dues[i],
-        calendars=stacked.calendars[i],
-        ramps=stacked.ramps[i],
-        actors=stacked.actors[i],
-        chain=chain,
-        channel=channel,
-    )
 
 
 def _stack_channels(

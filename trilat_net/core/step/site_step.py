@@ -45,7 +45,6 @@ from .site_arrays import (
     SiteArrays,
     TickBuffers,
     apply_change,
-    build_site_arrays,
     build_tick_buffers,
 )
 from .site_setup import SiteSetup, StaleAction
@@ -118,7 +117,7 @@ class Site:
         self._start_poses = [link.q0 for link in setup.links]
         self._sizer = CalendarSizer(setup)
         self._external = setup.external
-        self._arrays = build_site_arrays(setup, (MAX_CHANGES, MAX_RAMPS))
+        self._arrays = SiteArrays.build(setup, (MAX_CHANGES, MAX_RAMPS))
         self.layout = setup.layout
         columns = self.layout.columns()
         columns.pop("ch", None)

@@ -260,7 +260,8 @@ def find_life_reason(output: TickRecord) -> LifeReason:
 class LifeAlarm(NamedTuple):
     """Alarm that tells people why a site does not follow its peers, and what they can do.
 
-    `find_alarm` creates it. Pages and terminals show it as long as the site is in this mode.
+    `LifeAlarm.find` creates it. Pages and terminals show it as long as the site is in this
+    mode.
 
     Attributes:
         word: The mode, in capitals.
@@ -281,6 +282,56 @@ class LifeAlarm(NamedTuple):
     def __str__(self) -> str:
         return f"{self.word}: {self.reason}; {self.advice}"
 
+    @classmethod
+    def find(
+        cls,
+        session: str,
+        site: str,
+        mode: str,
+        mem: Sequence[float],
+        shared: int,
+        lost: Sequence[str] = (),
+    ) -> "LifeAlarm | None":
+        """Returns the alarm that tells people why a site does not follow its peers.
+
+        Only a site under the rule `glide` has alarms. By this rule an arm comes to rest while a
+        peer is silent, and follows again after a person's order. All facts come from the site's
+        record, the stored result of one tick.
+
+        Args:
+            session: Name of the session, which the advice of the alarm quotes.
+            site: Name of the site, which the advice quotes.
+            mode: Mode of the site, as the record names it.
+            mem: Numbers that the site keeps from tick to tick, the field `mem` of the record.
+                They contain the reason for the mode.
+            shared: Number of coordinates that sites share, by which `mem` is divided.
+            lost: Names of the peers without which the site goes on.
+
+        Returns:
+            The alarm. None if the site needs no attention, or if the record is not from a site
+            under this rule.
+        """
+        try:
+            reason = LifeReason(int(mem[2 * shared + 1]))
+        except (IndexError, ValueError, OverflowError):
+            # another rule, or a record of a stranger
+            return None
+        is_too_far = (mode, reason) == ("waiting", LifeReason.ALIGN_LIMIT)
+        if mode not in _ALARM_MODES and not is_too_far:
+            return _find_lost_alarm(lost)
+
+        # The dead-man switch ends a release, and no order does.
+        order = "" if reason is LifeReason.RELEASED else _ORDERS.get(mode, "")
+        before = _REMEDIES.get(reason, "") if mode == "fault" else ""
+        advice = _DEFAULT_ADVICE
+        if order:
+            advice = f"{before} trilat {order} --session {session} {site}".lstrip()
+        advice = _ADVICE.get((mode, reason), advice)
+        text = _REASONS.get(reason, reason.name.lower().replace("_", " "))
+        return LifeAlarm(
+            word=mode.upper(), reason=text, advice=advice, order=order, before=before
+        )
+
 
 _REMEDIES = {
     LifeReason.LIMIT_Q: "bring the joint back within its limits, then",
@@ -298,52 +349,6 @@ _ADVICE = {
     ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
 }
 _DEFAULT_ADVICE = "it goes on by itself once all its peers are heard"
-
-
-def find_alarm(
-    session: str,
-    site: str,
-    mode: str,
-    mem: Sequence[float],
-    shared: int,
-    lost: Sequence[str] = (),
-) -> LifeAlarm | None:
-    """Returns the alarm that tells people why a site does not follow its peers.
-
-    Only a site under the rule `glide` has alarms. By this rule an arm comes to rest while a
-    peer is silent, and follows again after a person's order. All facts come from the site's
-    record, the stored result of one tick.
-
-    Args:
-        session: Name of the session, which the advice of the alarm quotes.
-        site: Name of the site, which the advice quotes.
-        mode: Mode of the site, as the record names it.
-        mem: Numbers that the site keeps from tick to tick, the field `mem` of the record. They
-            contain the reason for the mode.
-        shared: Number of coordinates that sites share, by which `mem` is divided.
-        lost: Names of the peers without which the site goes on.
-
-    Returns:
-        The alarm. None if the site needs no attention, or if the record is not from a site
-        under this rule.
-    """
-    try:
-        reason = LifeReason(int(mem[2 * shared + 1]))
-    except (IndexError, ValueError, OverflowError):  # another rule, or a record of a stranger
-        return None
-    is_too_far = (mode, reason) == ("waiting", LifeReason.ALIGN_LIMIT)
-    if mode not in _ALARM_MODES and not is_too_far:
-        return _find_lost_alarm(lost)
-
-    # The dead-man switch ends a release, and no order does.
-    order = "" if reason is LifeReason.RELEASED else _ORDERS.get(mode, "")
-    before = _REMEDIES.get(reason, "") if mode == "fault" else ""
-    advice = _DEFAULT_ADVICE
-    if order:
-        advice = f"{before} trilat {order} --session {session} {site}".lstrip()
-    advice = _ADVICE.get((mode, reason), advice)
-    text = _REASONS.get(reason, reason.name.lower().replace("_", " "))
-    return LifeAlarm(word=mode.upper(), reason=text, advice=advice, order=order, before=before)
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:

@@ -12,24 +12,29 @@ Invariant:
 from collections.abc import Callable
 from typing import Any
 
-from ...core.arms import chain_stages
-from ...core.arms.chain import place_joints
-from ...core.arms.exogenous import TorqueTable
-from ...core.arms.task_space import add_task_torque, update_pose, update_task_errors
-from ...core.links.dominance import update_reference
-from ...core.step.fused_run import update_peaks, update_sums
-from ...core.step.jit import lane_leaf, set_lane_form
-from ...core.step.kernel import (
+from ...core import (
+    Array,
+    IntArray,
+    TorqueTable,
     adapts,
+    add_task_torque,
+    chain_stages,
     emit_stages,
     finish_advance,
     guard_reference,
     hold_motor_torque,
+    lane_leaf,
+    place_joints,
+    set_lane_form,
     sum_trapezoid,
+    update_peaks,
+    update_pose,
+    update_reference,
+    update_sums,
+    update_task_errors,
     updates_estimate,
 )
-from ...core.step.ticks import Mode
-from ...core.step.vectors import Array, IntArray
+from ...records import Mode
 from .lane_rows import LaneRow, RowsInLane, in_lane
 from .lane_vectors import GROUP, RowInGroup, in_group
 

@@ -15,33 +15,42 @@ from typing import NamedTuple
 import numpy as np
 from numba.core import types
 
-from ...core.links.channel import (
-    LOST,
-    advance_losses,
-    delay_sample,
-    find_delay_us,
-    find_due_ns,
-    loses_samples,
-    select_model,
-)
-from ...core.links.delay import (
+from ...core import (
     DELAY,
     LINK_MODEL_DTYPE,
     LOSS,
+    LOST,
+    Array,
+    ChannelArrays,
     DelayKind,
+    DrawKey,
+    IntArray,
+    LinkArrays,
+    LinkRow,
+    Points,
+    ReplayedInputs,
+    Row,
+    RowArray,
+    SiteArrays,
+    accept_sample,
+    advance_losses,
+    call_address,
+    channel_of,
     clamp_delay_us,
+    delay_sample,
     draw_delay_us,
+    find_delay_us,
+    find_due_ns,
+    find_lane_address,
+    first_tick_at,
+    lane_leaf,
+    leaf,
+    loses_samples,
+    release_sample,
+    select_model,
+    tick_ns,
+    uniforms,
 )
-from ...core.links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
-from ...core.links.philox import DrawKey, uniforms
-from ...core.plug.plugged import call_address
-from ...core.step.fused_run import ReplayedInputs
-from ...core.step.jit import find_lane_address, lane_leaf, leaf
-from ...core.step.kernel import channel_of
-from ...core.step.row_fields import LinkRow
-from ...core.step.site_arrays import SiteArrays
-from ...core.step.ticks import first_tick_at, tick_ns
-from ...core.step.vectors import Array, IntArray, Points, Row, RowArray
 
 BLOCK_TICKS = 500
 """Number of ticks whose deliveries are computed together."""

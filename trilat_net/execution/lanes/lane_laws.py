@@ -26,18 +26,19 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic, models, register_jitable, register_model
 
-from ...core.plug.compiled_law import (
+from ...core import (
     CHECKED,
     CompiledLaw,
     LawForm,
+    RowArray,
     collect_law_input,
+    digest_sibling_sources,
     finish_law,
+    leaf,
+    set_lane_form,
+    update_law_view,
 )
-from ...core.plug.law_view import update_law_view
-from ...core.plug.plugged import digest_sibling_sources
-from ...core.step.jit import leaf, set_lane_form
-from ...core.step.ticks import Mode
-from ...core.step.vectors import RowArray
+from ...records import Mode
 from .lane_rows import Constants, LaneTable, RowsInLane, offset_rows
 
 _DIVERGED = int(Mode.DIVERGED)

@@ -17,10 +17,16 @@ from numba.core import types
 from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
-from ...core.step.fused_run import NEVER_NS
-from ...core.step.jit import find_lane_address, read_lane_assembly
-from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import Array, IntArray
+from ...core import (
+    BUCKETS_PER_S,
+    NEVER_NS,
+    Array,
+    IntArray,
+    find_lane_address,
+    read_lane_assembly,
+    tick_ns,
+)
+from ...records import Mode
 from ..fused import FusedRun, RunMemory
 from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (

@@ -14,28 +14,38 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.arms import two_link_stages
-from ...core.arms.exogenous import (
+from ...core import (
+    BUCKETS_PER_S,
     NO_TORQUE,
+    Array,
+    IntArray,
+    Law,
+    Pair,
     SourceTorque,
     TorqueTable,
-    add_source_torque,
-    torque_on_arm,
-)
-from ...core.plug.plugged import call_address
-from ...core.step.fused_run import first_sent_column, update_peaks, update_sums
-from ...core.step.jit import lane_leaf, leaf, set_lane_form
-from ...core.step.kernel import (
+    Vector,
     adapts,
+    add_source_torque,
+    call_address,
     emit_stages,
     finish_advance,
+    first_sent_column,
+    five,
     hold_motor_torque,
+    lane_leaf,
+    leaf,
+    pair,
+    put_pair,
     reference_stages,
+    set_lane_form,
+    tick_ns,
+    torque_on_arm,
     torque_stage,
+    two_link_stages,
+    update_peaks,
+    update_sums,
 )
-from ...core.step.site_setup import Law
-from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
-from ...core.step.vectors import Array, IntArray, Pair, Vector, five, pair, put_pair
+from ...records import Mode
 from .lane_laws import compute_law
 from .lane_rows import Words, in_lane, pointer_to, select_row
 

@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from ...core.arms.exogenous import LIVE_KINDS, OWN_KINDS
-from ...core.step.site_arrays import SiteArrays
-from ...core.step.site_setup import StaleAction
+from ...core import LIVE_KINDS, OWN_KINDS, SiteArrays, StaleAction
 from ..fused import FusedRun
 from .lane_laws import LaneLaw, describe_lane_law
 from .lane_rows import Constants

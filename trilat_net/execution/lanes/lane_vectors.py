@@ -35,8 +35,7 @@ from numba.core.typing.templates import (
 )
 from numba.np import arrayobj
 
-from ...core.step.jit import set_lane_form
-from ...core.step.vectors import choose, round_down, whole
+from ...core import choose, round_down, set_lane_form, whole
 from .lane_rows import LANES, Constants, LaneField, LaneTable, offset_rows
 
 GROUP = 8

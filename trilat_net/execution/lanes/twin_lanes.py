@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.fused_run import ReplayedInputs
-from ...core.step.jit import is_lane_code_stored
-from ...core.step.ticks import NS_PER_S, first_tick_at
-from ...core.step.vectors import Array, IntArray
+from ...core import Array, IntArray, ReplayedInputs, first_tick_at, is_lane_code_stored
+from ...records import NS_PER_S
 from ..fused import FusedRun, mark_floats, scale_differences
 from .lane_deliveries import use_recorded_samples
 from .lane_rows import LANES, Words

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.jit import leaf
+from ...core import leaf
 from ..mcap_records import DEFINITIONS, MESSAGE_HEAD, OP_MESSAGE, RECORD_HEAD_BYTES
 from .byte_words import copy_bytes, load_little
 from .packed_messages import Bytes, Ints

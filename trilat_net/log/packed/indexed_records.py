@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.vectors import Array
-from ...net.messages import MODE_WORDS
+from ...core import Array
+from ...net import MODE_WORDS
 from ...records import Layout
 from . import record_scan
 from .packed_messages import Ints, PackedMessages

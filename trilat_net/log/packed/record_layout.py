@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ...net.messages import MODE_WORDS, VERSION
+from ...net import MODE_WORDS, VERSION
 from ...records import Layout
 from .packed_messages import Ints
 

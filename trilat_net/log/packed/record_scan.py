@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.step.jit import leaf, loop_leaf
-from ...net.wire import MAX_BYTES
+from ...core import leaf, loop_leaf
+from ...net import MAX_BYTES
 from ...records import MAX_JOINTS, MAX_LAW_MEMORY
 from .byte_words import load_big, load_little
 from .packed_messages import Bytes, Ints

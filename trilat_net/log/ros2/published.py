@@ -15,10 +15,10 @@ Invariant:
 
 from collections.abc import Callable, Iterable, Sequence
 
-from ...core.arms.task_space import POSE, POSITION
-from ...net.messages import LinkStats, State
+from ...core import POSE, POSITION
+from ...log import QuaternionSigns
+from ...net import LinkStats, State
 from ...scenario import Scenario
-from ..orientations import QuaternionSigns
 from . import cdr
 from .robot_model import WORLD, FramePose, RobotModel, Vector, compute_quaternion
 from .ros2_messages import (
@@ -29,7 +29,7 @@ from .ros2_messages import (
     Ros2SiteChannels,
     stack_signals,
 )
-from .topic_names import DIAGNOSTICS, FRAMES, TopicTable
+from .topic_names import DIAGNOSTICS, FRAMES_TOPIC, TopicTable
 
 Topics = dict[str, Ros2Channel]
 """Topics by name: by the name within trilat-net for one site, by the full name for a session.
@@ -54,7 +54,7 @@ _FRAMES_METADATA = {
 }
 _DIAGNOSTICS_METADATA = {"content": "modes and loops of the sites, once a second"}
 COMMON_TOPICS = {
-    FRAMES: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
+    FRAMES_TOPIC: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
     DIAGNOSTICS: Ros2Channel(cdr.DIAGNOSTICS, _DIAGNOSTICS_METADATA),
 }
 """Topics that all sessions have in common, by their full names."""

@@ -18,8 +18,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from ...scenario import Scenario
-from ...scenario.arms import read_arm
+from ...scenario import Scenario, read_arm
 from .cdr import DEFINITIONS, TransformPacker
 
 WORLD = "world"

@@ -22,15 +22,12 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from ...core.arms.task_space import POSITION
+from ...core import POSITION
 from ...files import reading
-from ...net.messages import MODE_WORDS, Event, LinkStats, State
+from ...log import McapWriter, compute_task_errors
+from ...net import MODE_WORDS, Event, LinkStats, State
 from ...records import Mode, TickRecord
-from ...scenario import Scenario
-from ...scenario.arms import TASK_AXES
-from ...scenario.event_text import describe_event
-from ..mcap_writer import McapWriter
-from ..site_log import compute_task_errors
+from ...scenario import TASK_AXES, Scenario, describe_event
 from . import cdr
 from .robot_model import RobotModel, name_ros_joints
 
@@ -71,6 +68,11 @@ class Ros2Channel(NamedTuple):
     kind: str
     about: dict[str, str]
     latched: bool = False
+
+    def is_robot_description(self) -> bool:
+        """Returns True if the channel contains the URDF of an arm, whatever its topic is."""
+        content = self.about.get("content")
+        return self.kind == cdr.STRING and content == ROBOT_METADATA["content"]
 
 
 class StandardChannels:
@@ -124,16 +126,6 @@ ROBOT_CHANNELS = {
     ROBOT: Ros2Channel(cdr.STRING, ROBOT_METADATA),
     FRAMES: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
 }
-
-
-def is_robot_description(channel: Ros2Channel) -> bool:
-    """Tells whether a channel contains the URDF of an arm, whatever the name of its topic is.
-
-    Args:
-        channel: The channel, of a log, a bag or the live bridge.
-    """
-    content = channel.about.get("content")
-    return channel.kind == cdr.STRING and content == ROBOT_METADATA["content"]
 
 
 _LEVELS = {

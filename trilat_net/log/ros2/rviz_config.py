@@ -19,7 +19,7 @@ from string import Template
 from ...errors import UsageError
 from .cdr import DEFINITIONS, POSE
 from .robot_model import SPACING_M, WORLD
-from .ros2_messages import Ros2Channel, is_robot_description
+from .ros2_messages import Ros2Channel
 
 _SUFFIX = ".rviz"
 """Suffix of the templates, and of configurations."""
@@ -38,7 +38,7 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
     arm_count = 0
     for topic, channel in topics.items():
         site_and_name = "/".join(topic.split("/")[-2:])
-        if is_robot_description(channel):
+        if channel.is_robot_description():
             arm_count += 1
             site, _, _ = site_and_name.rpartition("/")
             displays += _fill_template("robot_model", name=site, topic=topic)

@@ -21,7 +21,7 @@ import msgspec
 
 from ...errors import UsageError, suggest_nearest
 from ...files import open_regular
-from ...net.ros2_names import check_ros_name
+from ...net import check_ros_name
 
 NAMINGS = ("crisp", "crtk")
 """The two built-in conventions: CRISP, and the Collaborative Robotics Toolkit (CRTK)."""
@@ -56,7 +56,7 @@ TOPICS = {
 CRISP is a set of ROS 2 controllers. CRTK is the convention of the da Vinci Research Kit. A
 vector that a control law sends has the same name in both: "sent_" and the name of the vector.
 """
-FRAMES = "tf"
+FRAMES_TOPIC = "tf"
 """Topic with the poses of all links, under the name that tools of ROS expect."""
 DIAGNOSTICS = "diagnostics"
 """Topic with the status of all sites, under the name that tools of ROS expect."""
@@ -109,6 +109,37 @@ class TopicTable(NamedTuple):
             return name[1:]
         return f"{session}/{site}/{name}"
 
+    @classmethod
+    def read(cls, source: str) -> "TopicTable":
+        """Reads under which names the topics of a session should appear in ROS 2.
+
+        The names follow a built-in convention, or come from a TOML file. The conventions are
+        "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit).
+        The file states only the names that differ from "crisp". For example, the line
+        `joint_states = "arm/joint_states"` applies to all sites. A table `[sites.s]` applies
+        only to the site `s`. It may also contain the settings of a real robot, which are the
+        fields of `RobotTable`.
+
+        Args:
+            source: "crisp", "crtk" or the path of a file.
+
+        Returns:
+            The names, and the settings of real robots.
+
+        Raises:
+            UsageError: The file cannot be read, or a name in it is not valid.
+        """
+        if source in NAMINGS:
+            return TopicTable(_list_names(source))
+        changes = _read_names_file(source)
+        _check_names(source, changes.names)
+        for site_names in changes.of_site.values():
+            _check_names(source, site_names)
+        all_names = {**_list_names("crisp"), **changes.names}
+        table = changes._replace(names=all_names)
+        _check_unique_names(source, table)
+        return table
+
 
 def make_session_name(text: str) -> str:
     """Converts the name of a session to a name that ROS 2 accepts.
@@ -120,36 +151,6 @@ def make_session_name(text: str) -> str:
     """
     name = re.sub(r"[^A-Za-z0-9_]", "_", text)
     return name if name[:1].isalpha() else f"_{name}"
-
-
-def read_topic_table(source: str) -> TopicTable:
-    """Reads under which names the topics of a session should appear in ROS 2.
-
-    The names follow a built-in convention, or come from a TOML file. The conventions are
-    "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit). The
-    file states only the names that differ from "crisp". For example, the line `joint_states =
-    "arm/joint_states"` applies to all sites. A table `[sites.s]` applies only to the site `s`.
-    It may also contain the settings of a real robot, which are the fields of `RobotTable`.
-
-    Args:
-        source: "crisp", "crtk" or the path of a file.
-
-    Returns:
-        The names, and the settings of real robots.
-
-    Raises:
-        UsageError: The file cannot be read, or a name in it is not valid.
-    """
-    if source in NAMINGS:
-        return TopicTable(_list_names(source))
-    changes = _read_names_file(source)
-    _check_names(source, changes.names)
-    for site_names in changes.of_site.values():
-        _check_names(source, site_names)
-    all_names = {**_list_names("crisp"), **changes.names}
-    table = changes._replace(names=all_names)
-    _check_unique_names(source, table)
-    return table
 
 
 def _list_names(naming: str) -> dict[str, str]:

@@ -21,14 +21,10 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 
-from ...net import topics
-from ...net.messages import Event, LinkStats
+from ...log import FULL_RATE_HZ, VIZ_ROOT, MakeViews, McapWriter, PutMessage, ReceiveMessage
+from ...net import Event, LinkStats, topics
 from ...records import NS_PER_S
 from ...scenario import Scenario
-from ..log_layout import VIZ_ROOT
-from ..log_writer import MakeViews, PutMessage, ReceiveMessage
-from ..mcap_writer import McapWriter
-from ..view_rates import FULL_RATE_HZ
 from . import ros2_messages
 from .cdr import JointStatePacker, pack_string
 from .ros2_messages import Record, Ros2Channel, SignalRow

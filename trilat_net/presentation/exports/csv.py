@@ -9,8 +9,7 @@ more files describe the columns and contain the scenario.
 import csv
 from pathlib import Path
 
-from ...log.data_tables import Table
-from ...log.log_reader import Log
+from ...log import Log, Table
 from ..export import ExportFormat, Written, write_table_files
 
 _ROWS_AT_ONCE = 4096

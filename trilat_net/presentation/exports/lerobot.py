@@ -33,23 +33,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...analysis.arm_rows import build_arm_rows
-from ...analysis.dominance_history import (
+from ...analysis import (
+    build_arm_rows,
     find_program,
     find_user_shares,
     find_users,
     trace_dominance,
 )
-from ...core.arms.task_space import POSITION
-from ...core.step.ticks import NS_PER_S
-from ...core.step.vectors import Array
+from ...core import POSITION, Array
 from ...errors import LogError, UsageError, count_nouns, join_words
 from ...files import import_extra
-from ...log.log_reader import Log
-from ...log.orientations import MATRIX_ENTRIES, expand_poses
-from ...log.provenance import collect_provenance
-from ...log.record_columns import Ints
-from ...scenario.arms import TASK_AXES
+from ...log import MATRIX_ENTRIES, Ints, Log, collect_provenance, expand_poses
+from ...records import NS_PER_S
+from ...scenario import TASK_AXES
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
 from ..plugin_observation import find_plugin_actions, observe_as_plugin
 

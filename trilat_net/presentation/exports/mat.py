@@ -14,8 +14,7 @@ import numpy as np
 
 from ...errors import UsageError
 from ...files import import_extra
-from ...log.data_tables import Column, Table
-from ...log.log_reader import Log
+from ...log import Column, Log, Table
 from ..export import ExportFormat, Written, name_inside, read_texts, store_tables
 
 _EXTRA = ("scipy.io", "mat", "MAT files")

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...log.data_tables import Column, Table
-from ...log.log_reader import Log
+from ...log import Column, Log, Table
 from ..export import ExportFormat, Written, name_inside, read_texts, store_tables
 
 

@@ -8,8 +8,7 @@ in the folder describe the columns and contain the scenario.
 import io
 from pathlib import Path
 
-from ...log.data_tables import Table, to_data_frame
-from ...log.log_reader import Log
+from ...log import Log, Table
 from ..export import ExportFormat, Written, write_table_files
 
 
@@ -28,7 +27,7 @@ def _write_table(table: Table, path: Path) -> None:
     """Writes a table as a Parquet file."""
     # The file is written by Python and not by polars, so that a full disk raises OSError.
     buffer = io.BytesIO()
-    to_data_frame(table).write_parquet(buffer, compression="zstd")
+    table.to_data_frame().write_parquet(buffer, compression="zstd")
     path.write_bytes(buffer.getbuffer())
 
 

@@ -19,22 +19,21 @@ from pathlib import Path
 
 import numpy as np
 
-from ...analysis.dominance_history import trace_dominance
-from ...core.step.ticks import NS_PER_S
-from ...log.log_layout import SCENARIO
-from ...log.log_reader import Log
-from ...log.mcap_writer import McapWriter
-from ...log.provenance import collect_provenance
-from ...log.ros2 import cdr, ros2_messages
-from ...log.ros2.published import SiteMessages, list_full_topics, pack_session_diagnostics
-from ...log.ros2.topic_names import (
+from ...analysis import trace_dominance
+from ...log import SCENARIO, Log, McapWriter, collect_provenance
+from ...log.ros2 import (
     DIAGNOSTICS,
-    FRAMES,
+    FRAMES_TOPIC,
     NAMINGS,
+    SiteMessages,
     TopicTable,
+    cdr,
+    list_full_topics,
     make_session_name,
-    read_topic_table,
+    pack_session_diagnostics,
+    ros2_messages,
 )
+from ...records import NS_PER_S
 from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
@@ -82,7 +81,7 @@ def export_ros2(
         UsageError: The names cannot be read.
         OSError: The disk refused the data.
     """
-    table = read_topic_table(names)
+    table = TopicTable.read(names)
     log_session = log.session.get("session", "") or log.scenario.name
     session = make_session_name(log_session)
     with path.open("wb") as stream:
@@ -197,7 +196,7 @@ class _SiteBag:
                 description = (topic, self._messages.description)
                 messages.insert(0, description)
             for data in self._messages.pack_frames(record):
-                messages.append((FRAMES, data))
+                messages.append((FRAMES_TOPIC, data))
             yield log_ns[row], publish_ns[row], messages
             is_last = count == len(records)
             if is_last or count % _RECORDS_PER_REPORT == 0:

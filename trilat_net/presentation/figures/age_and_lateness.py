@@ -21,15 +21,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis.link_summary import (
+from ...analysis import (
     DelayDistribution,
+    StatedModel,
     has_one_constant_delay,
+    list_changes,
+    list_stated_models,
     measure_delay_distributions,
+    recorded_end_s,
 )
-from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
-from ...core.step.vectors import Array
-from ...log.log_reader import Log
-from ...log.record_columns import Ints
+from ...core import Array
+from ...log import Ints, Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..plot_signals import sample_ages_ms

@@ -19,12 +19,10 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import site_signals
-from ...analysis.arm_rows import joint_positions_m, upright_axes
-from ...analysis.timeline import recorded_end_s
-from ...core.step.vectors import Array
-from ...log.log_reader import Log
-from ...scenario.arms import ArmModel
+from ...analysis import joint_positions_m, recorded_end_s, site_signals, upright_axes
+from ...core import Array
+from ...log import Log
+from ...scenario import ArmModel
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..html_templates import render_macro

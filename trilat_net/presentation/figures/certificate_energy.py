@@ -24,13 +24,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis.certificate.energy_balance import EnergyBalance
-from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
-from ...analysis.certificate.premises import find_unjudged_spans
-from ...analysis.certificate.stability_certificate import Certificate, certify
-from ...core.step.vectors import Array
-from ...log.log_reader import Log
-from ...own_code.code_consent import may_run_user_laws
+from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify, find_unjudged_spans
+from ...core import Array
+from ...log import Log
+from ...own_code import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..premise_text import explain_no_functional
@@ -175,7 +172,7 @@ def draw_observed_energy(
 
 def _has_declared_energies(log: Log) -> bool:
     """Returns True if at least one control law of the run declares energies."""
-    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
+    observed = ObservedEnergy.of_log(log, own_laws=may_run_user_laws(log.scenario))
     return observed is not None and bool(observed.curves)
 
 
@@ -187,7 +184,7 @@ def _has_declared_energies(log: Log) -> bool:
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
     """Draws the declared energies of a log's control laws, for the registry of figures."""
-    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
+    observed = ObservedEnergy.of_log(log, own_laws=may_run_user_laws(log.scenario))
     assert observed is not None
     return draw_observed_energy(log, observed, form)
 

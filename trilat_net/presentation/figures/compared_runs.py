@@ -14,13 +14,11 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from ...analysis import site_signals
-from ...analysis.timeline import recorded_end_s
-from ...core.step.vectors import Array
+from ...analysis import recorded_end_s, site_signals
+from ...core import Array
 from ...errors import UsageError, count_nouns
-from ...log.log_reader import Log
-from ...log.site_log import SiteLog
-from ...scenario.describe import compare_scenarios
+from ...log import Log, SiteLog
+from ...scenario import compare_scenarios
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .joint_motion import add_joint_rows, choose_height_in

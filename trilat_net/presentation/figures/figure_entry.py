@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeVar
 
 from matplotlib.figure import Figure
 
-from ...log.log_reader import Log
+from ...log import Log
 from ..appearance import FigureSize
 
 Draw = Callable[[Log, FigureSize], Figure]

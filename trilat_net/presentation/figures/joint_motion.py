@@ -23,17 +23,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import site_signals
-from ...analysis.arm_rows import build_arm_rows
-from ...analysis.dominance_history import trace_dominance
-from ...analysis.site_signals import SETTLED_ERROR_RAD
-from ...analysis.timeline import list_changes
-from ...analysis.torque_sources import list_walls, wall_depth, wall_force
-from ...core.arms.chain import LINK_PARAMETERS
-from ...core.step.vectors import Array
-from ...execution.virtual_comparison import simulate_without_operators
-from ...log.log_reader import Log
-from ...own_code.code_consent import find_user_laws
+from ...analysis import (
+    SETTLED_ERROR_RAD,
+    build_arm_rows,
+    list_changes,
+    list_walls,
+    site_signals,
+    trace_dominance,
+    wall_depth,
+    wall_force,
+)
+from ...core import LINK_PARAMETERS, Array
+from ...execution import simulate_without_operators
+from ...log import Log
+from ...own_code import find_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless

@@ -27,13 +27,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MultipleLocator
 
-from ...analysis.theory.characteristic_roots import Spectrum
-from ...analysis.theory.delay_margin import MAX_COMMON_DELAY_S
-from ...analysis.theory.frequency_search import Minima
-from ...analysis.theory.linear_analysis import LinearAnalysis
-from ...analysis.theory.port_analysis import PortAnalysis
-from ...analysis.theory.port_response import Transparency
-from ...core.step.vectors import Array
+from ...analysis import (
+    MAX_COMMON_DELAY_S,
+    LinearAnalysis,
+    Minima,
+    PortAnalysis,
+    Spectrum,
+    Transparency,
+)
+from ...core import Array
 from .. import style
 from ..appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 

@@ -20,12 +20,11 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ...analysis.twins.twin_growth import PushedTwins, TwinGrowth
+from ...analysis import PushedTwins, TwinGrowth
 from ...errors import UsageError, suggest_nearest
 from ...files import make_folder, refuse_existing
-from ...log.log_reader import Log, open_log
-from ...log.mcap_reader import Progress
-from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
+from ...log import Log, Progress, open_log
+from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize
 from ..style import DASHES, FIGURE_FORMATS, write_figure
 from .compared_runs import COMPARED_SIGNALS, draw_compared_runs, list_common_sites
 from .figure_entry import FigureEntry, list_figures
@@ -60,7 +59,7 @@ def figure(
         UsageError: The figure or the width does not exist, or the log has nothing to show in
             the figure.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     opened = log if isinstance(log, Log) else open_log(log)
     return _find_figure(opened, name).draw(opened, form)
 
@@ -104,7 +103,7 @@ def write_figures(
         UsageError: A figure, the width or a format does not exist, the log has nothing to show
             in a figure, or a file exists.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     unique_names = list(dict.fromkeys(names))
     drawings: dict[str, Callable[[], Figure]] = {}
     for name in unique_names or list_drawable_figures(log):
@@ -151,7 +150,7 @@ def write_overlay(
         UsageError: A figure, the width or a format does not exist, the errors of the logs have
             different units, the logs cannot be drawn in a figure, or a file exists.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     known = (OVERLAY, *COMPARED_SIGNALS)
     for name in names:
         if name not in known:

@@ -19,14 +19,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import site_signals
-from ...analysis.judge import certify_run
-from ...analysis.site_signals import largest_magnitude, settling_time_of_all_s
-from ...analysis.timeline import recorded_end_s
-from ...core.step.vectors import Array
+from ...analysis import (
+    certify_run,
+    largest_magnitude,
+    recorded_end_s,
+    settling_time_of_all_s,
+    site_signals,
+)
+from ...core import Array
 from ...errors import UsageError
-from ...log.log_reader import Log
-from ...own_code.code_consent import may_run_user_laws
+from ...log import Log
+from ...own_code import may_run_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .compared_runs import label_runs

@@ -24,21 +24,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ...analysis.run_end import classify_log_end
-from ...analysis.twins.envelope_trend import EnvelopeTrend
-from ...analysis.twins.twin_growth import (
+from ...analysis import (
     MOST_LOG,
+    EnvelopeTrend,
     PushedTwins,
     PushGrowth,
+    RunEnd,
+    TwinGrowth,
     measure_amplitude,
-    measure_twins,
 )
-from ...core.step.ticks import BUCKETS_PER_S
-from ...core.step.vectors import Array
-from ...execution.fused import explain_not_repeatable
-from ...execution.twins import SMALLEST, TwinPath, Twins
-from ...log.log_reader import Log
-from ...own_code.code_consent import may_run_user_laws
+from ...core import BUCKETS_PER_S, Array
+from ...execution import SMALLEST, TwinPath, Twins, explain_not_repeatable
+from ...log import Log
+from ...own_code import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
@@ -137,7 +135,7 @@ def _explain_absent_twins(log: Log) -> str:
 def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
     """Draws the differences of twins that are pushed at the start of a log's run."""
     own_laws = may_run_user_laws(log.scenario)
-    growth = measure_twins(log, classify_log_end(log), own_laws=own_laws)
+    growth = TwinGrowth.of_log(log, RunEnd.of_log(log), own_laws=own_laws)
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 
 

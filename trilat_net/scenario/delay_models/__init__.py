@@ -21,9 +21,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
 import numpy as np
 from msgspec import Meta
 
-from ...core.links.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel
-from ...core.plug.plugged import compile_to_address, list_numbers
-from ...core.step.vectors import Points
+from ...core import (
+    LINK_MODEL_DTYPE,
+    MAX_DELAY_US,
+    DelayKind,
+    LinkModel,
+    Points,
+    compile_to_address,
+    list_numbers,
+)
 from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000

@@ -17,8 +17,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
-from ...core.links.delay import DelayKind, LinkModel, TraceEnd
-from ...core.step.vectors import Points
+from ...core import DelayKind, LinkModel, Points, TraceEnd
 from ...fields import KeyProblem, TomlTable
 from ..delay_traces import parse_trace
 from ..key_checks import is_number

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from ...core.links.delay import draw_pair
+from ...core import draw_pair
 from . import Milliseconds, OwnDelay
 
 

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Union
 import msgspec
 
 from ... import fields
-from ...core.arms.exogenous import TorqueKind, TorqueSource
-from ...core.step.vectors import Array
+from ...core import Array, TorqueKind, TorqueSource
 from ...errors import ScenarioError
 from ..distributions import Draws
 from ..key_checks import (

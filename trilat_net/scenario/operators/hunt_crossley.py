@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ... import fields
-from ...core.step.vectors import Array
+from ...core import Array
 from . import OwnActor
 
 

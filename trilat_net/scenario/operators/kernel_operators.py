@@ -22,11 +22,9 @@ import numpy as np
 from msgspec import Meta
 
 from ... import fields
-from ...core.arms.chain import MAX_JOINTS
-from ...core.arms.exogenous import TorqueKind, TorqueSource
-from ...core.life.live_hand import HandReach, HandRules
-from ...core.step.site_setup import MotionLimits
+from ...core import HandReach, HandRules, MotionLimits, TorqueKind, TorqueSource
 from ...errors import ScenarioError, count_nouns
+from ...records import MAX_JOINTS
 from ..arms import ArmModel
 from ..key_checks import check_choice, field_names
 from . import ActorBase, HeldArm, SampledActor, TimedActor

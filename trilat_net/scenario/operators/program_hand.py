@@ -19,21 +19,27 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 from msgspec import Meta, field
 
 from ... import fields
-from ...core.life.own_hand import HandContext, HandProgram, HandView, OwnHand
-from ...core.step.site_arrays import SiteArrays
-from ...core.step.site_step import Site
-from ...core.step.ticks import NS_PER_S, tick_ns
-from ...core.step.vectors import Array
+from ...core import (
+    Array,
+    HandContext,
+    HandProgram,
+    HandView,
+    OwnHand,
+    Site,
+    SiteArrays,
+    tick_ns,
+)
 from ...errors import describe_exception
-from ...own_code.class_arguments import make_own_instance
-from ...own_code.imported_code import (
+from ...own_code import (
     CLASS_PATTERN,
     CodeKey,
     Watch,
     call_directly,
     import_class,
+    make_own_instance,
     read_code,
 )
+from ...records import NS_PER_S
 from . import HeldArm
 from .kernel_operators import LiveHand
 
@@ -205,6 +211,28 @@ class HandSite(NamedTuple):
         rules = self.spec.make_rules(tick_rate_hz, arm)
         return OwnHand(rules, tick_rate_hz // self.rate_hz, delay_ticks, locate)
 
+    @classmethod
+    def find(cls, scenario: "Scenario", site: str) -> "HandSite | None":
+        """Finds the program that operates the arm of a site, if the scenario has one.
+
+        Args:
+            scenario: Description of the experiment.
+            site: Name of the site.
+
+        Returns:
+            The site with its program. None if no operator of the site is a program.
+        """
+        for hand in scenario.sites[site].hands:
+            if isinstance(hand, ProgramHand):
+                return HandSite(
+                    scenario=scenario,
+                    name=site,
+                    spec=hand,
+                    rate_hz=hand.rate_hz,
+                    delay_s=hand.delay_ms * 1e-3,
+                )
+        return None
+
 
 class HandPlayer:
     """Calls a program that operates an arm, and passes its actions to the site of the arm.
@@ -330,28 +358,6 @@ class HandPlayer:
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
 
-def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Finds the program that operates the arm of a site, if the scenario has one.
-
-    Args:
-        scenario: Description of the experiment.
-        site: Name of the site.
-
-    Returns:
-        The site with its program. None if no operator of the site is a program.
-    """
-    for hand in scenario.sites[site].hands:
-        if isinstance(hand, ProgramHand):
-            return HandSite(
-                scenario=scenario,
-                name=site,
-                spec=hand,
-                rate_hz=hand.rate_hz,
-                delay_s=hand.delay_ms * 1e-3,
-            )
-    return None
-
-
 def make_hand_program(hand_site: HandSite) -> HandProgram:
     """Creates the program that operates the arm of a site, an instance of the user's class.
 
@@ -391,7 +397,7 @@ def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
     """
     players = {}
     for name in scenario.names:
-        hand_site = find_own_hand(scenario, name)
+        hand_site = HandSite.find(scenario, name)
         if hand_site is not None:
             players[name] = HandPlayer(hand_site, make_hand_program(hand_site))
     return players

@@ -18,7 +18,7 @@ from tests.sites.sessions import Session, reached
 from trilat_net.app.input_device import DeviceState
 from trilat_net.core.life.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario

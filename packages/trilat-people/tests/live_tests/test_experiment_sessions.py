@@ -15,7 +15,7 @@ from trilat_people.experiment.trial_run import ExperimentTrial
 from tests.live.browsers import needs_browser, page_address, shows
 from tests.live.processes import Process, Stage, is_running
 from tests.net.waiting import until
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 
 from .participants import (

@@ -31,7 +31,7 @@ from trilat_net.analysis.certificate.running_energy import RecordWindow
 from trilat_net.app.demo_session import SessionResult
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.execution.verify import verify
+from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
 

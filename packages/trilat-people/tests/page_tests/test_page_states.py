@@ -10,7 +10,7 @@ from tests.live.browsers import needs_browser
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
-from trilat_net.core.step.ticks import LifeReason, find_alarm
+from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.net.clock import SystemClock
 
 from .recorded_session import ROLES, SCREENS, RecordedSession, record_session
@@ -36,7 +36,7 @@ ALARMS = {
 
 def alarmed(session: RecordedSession, role: str, mode: str) -> Json:
     """The sites of the newest frame of a role, each that it knows about in a mode with its alarm."""
-    alarm = find_alarm("t", "s", mode, [0.0] * 5 + [float(ALARMS[mode])], 2)
+    alarm = LifeAlarm.find("t", "s", mode, [0.0] * 5 + [float(ALARMS[mode])], 2)
     assert alarm is not None
     advice = alarm.before if alarm.order else alarm.advice
     shown = {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}

@@ -7,7 +7,7 @@ the file, so that a further device needs no entry in any list.
 from importlib import import_module
 from pkgutil import iter_modules
 
-from trilat_net.app.input_device import Device
+from trilat_net.app import Device
 from trilat_net.errors import UsageError
 
 

@@ -17,8 +17,8 @@ import msgspec
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from trilat_net.app.input_device import DeviceState, Vector
-from trilat_net.net.host_names import check_hosts
+from trilat_net.app import DeviceState, Vector
+from trilat_net.net import check_hosts
 
 SILENCE_S = 0.15
 """Silence of the service after which the connection is closed, in s.

@@ -11,8 +11,8 @@ import struct
 from pathlib import Path
 from typing import ClassVar, Self
 
-from trilat_net.app.input_device import DeviceState, Vector
-from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.app import DeviceState, Vector
+from trilat_net.net import Clock, SystemClock
 
 STILL_NS = 100_000_000
 """Time without a report after which the cap counts as not deflected, in ns."""

@@ -20,8 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from trilat_net.fields import split_unit
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
+from trilat_net.presentation import COLUMN_IN, SITE_COLOURS, FigureSize, style
 
 from .completion_times import COMPLETION, find_median, find_unit_medians, summarise_times
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
@@ -29,7 +28,7 @@ from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 Look = dict[str, Any]
 """Options of matplotlib for a line and its markers."""
 
-_FORM = make_print_size(COLUMN_IN)
+_FORM = FigureSize.for_print(COLUMN_IN)
 _HEIGHT_IN = 2.6
 _USER: Look = {
     "color": style.FAINT,

@@ -26,14 +26,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.fields import split_unit
 from trilat_net.files import find_version, make_folder, make_subfolder, write_whole
-from trilat_net.presentation import style
-from trilat_net.presentation.result_text import Block, TextTable, compose, format_number
+from trilat_net.presentation import Block, TextTable, compose, format_number, style
 from trilat_net.results import Result
-from trilat_net.work.study_folder import encode_csv
+from trilat_net.work import encode_csv
 
 from .completion_times import (
     COMPLETION,

@@ -24,11 +24,18 @@ import msgspec
 
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.files import digest_file, make_results_folder, make_subfolder, write_whole
-from trilat_net.presentation.result_text import Block, TextTable
+from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import parse_scenario
-from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
-from trilat_net.work.study_folder import RunJournal, build_resume_hint, encode_csv
+from trilat_net.work import (
+    Progress,
+    RunJournal,
+    Workers,
+    build_resume_hint,
+    encode_csv,
+    ignore_progress,
+    open_worker_pool,
+)
 
 from .completion_times import COMPLETION, find_median, is_completed
 from .protocol import Choices, ExperimentPlan, PlannedTrial, plan_experiment, read_protocol

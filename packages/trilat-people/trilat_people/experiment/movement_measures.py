@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 
 ONSET_SHARE = 0.05

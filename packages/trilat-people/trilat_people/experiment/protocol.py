@@ -28,7 +28,7 @@ from msgspec.structs import replace
 
 from trilat_net.errors import ScenarioError, TrilatError, UsageError, count_nouns
 from trilat_net.fields import Frozen, Positive
-from trilat_net.presentation.result_text import Block, TextTable
+from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 

@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.files import import_extra
-from trilat_net.work.intervals import mean_interval, wilson_interval
+from trilat_net.work import MeanInterval, wilson_interval
 
 Row = Mapping[str, Any]
 """A trial: its participant, pair and condition, and its measures by name."""
@@ -190,7 +190,7 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
     Returns:
         The summary. With a single participant it has no deviation and no interval.
     """
-    mean = mean_interval(values)
+    mean = MeanInterval.of_values(values)
     if mean is None:
         return ConditionMean(
             condition=condition,

@@ -22,9 +22,7 @@ import numpy as np
 from msgspec import Meta
 from msgspec.structs import replace
 
-from trilat_net.core.life.own_hand import HandContext, HandView
-from trilat_net.core.plug.user_law import PeerView
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array, HandContext, HandView, PeerView
 from trilat_net.fields import Frozen
 
 from .tasks import TrialGoal, place_slave

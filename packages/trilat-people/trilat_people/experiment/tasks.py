@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.fields import Frozen
 
 Metres = Annotated[float, Meta(gt=0.0, le=10.0)]

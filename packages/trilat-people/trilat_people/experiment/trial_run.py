@@ -22,23 +22,21 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from trilat_net.analysis.aligned import AlignedRecords, align_records
-from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows
-from trilat_net.analysis.link_summary import sample_ages_ns
-from trilat_net.analysis.torque_sources import split_torque
-from trilat_net.core.step.ticks import NS_PER_S
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import (
+    AlignedRecords,
+    EndEffectorRows,
+    TorqueSplit,
+    align_records,
+    build_arm_rows,
+    sample_ages_ns,
+)
+from trilat_net.core import Array
 from trilat_net.errors import LogError
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.verify import verify
-from trilat_net.execution.virtual import record_virtual
+from trilat_net.execution import FusedRun, record_virtual, verify
 from trilat_net.files import digest_file
-from trilat_net.log.log_reader import Log, open_log
-from trilat_net.log.record_columns import Ints
-from trilat_net.log.site_log import SiteLog
-from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
-from trilat_net.scenario.scenario_types import Change
+from trilat_net.log import Ints, Log, SiteLog, open_log
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_scenario
 
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
 from .protocol import PlannedTrial, Protocol, limit_forces
@@ -354,7 +352,7 @@ class ExperimentTrial:
         forces: list[Array] = []
         for number, user in enumerate(users, 1):
             records = aligned[user]
-            split = split_torque(records, log.scenario)
+            split = TorqueSplit.of_records(records, log.scenario)
             end_effector = split.end_effector
             is_in_trial = records.t_s <= outcome.ended_s
             # The force of the hand ON its arm, shape (K, 2) or (K, 3).

@@ -23,13 +23,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from trilat_net.app.demo_session import SessionResult, compile_core, run_demo
-from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.app import SessionResult, compile_core, run_demo
 from trilat_net.errors import LogError, LogRefused, RunFailed
 from trilat_net.files import describe_write_error, make_subfolder
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net import Bus, Clock, SystemClock, ZenohBus
+from trilat_net.records import NS_PER_S
 from trilat_net.signals import Interrupt
 
 from ..experiment.experiment_run import LOGS, Experiment, Note

@@ -22,10 +22,10 @@ from typing import Any
 
 import msgspec
 
-from trilat_net.core.step.ticks import NS_PER_S, tick_ns
+from trilat_net.core import tick_ns
 from trilat_net.errors import UsageError
-from trilat_net.net.clock import Clock
-from trilat_net.net.messages import HALTED_MODES
+from trilat_net.net import HALTED_MODES, Clock
+from trilat_net.records import NS_PER_S
 
 from ..experiment.protocol import ExperimentPlan, Step
 from ..experiment.trial_run import ExperimentTrial, TrialEntry, TrialJudge

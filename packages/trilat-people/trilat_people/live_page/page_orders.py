@@ -37,12 +37,18 @@ import msgspec
 from msgspec import Meta
 
 from trilat_net.errors import WireError
-from trilat_net.net import topics
-from trilat_net.net.arm_client import SiteSender, make_hand_sender
-from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.clock import Clock
-from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
-from trilat_net.net.wire import decode, encode
+from trilat_net.net import (
+    Bus,
+    ChangeReply,
+    ChangeRequest,
+    Clock,
+    HandMessage,
+    Inbox,
+    SiteSender,
+    decode,
+    encode,
+    topics,
+)
 
 MAX_MESSAGE_BYTES = 4_096
 """Largest size of a page's message."""
@@ -487,7 +493,7 @@ class PageHands:
         if site not in self._senders:
             if not order.grip:
                 return
-            new_sender = make_hand_sender(self._bus, self._clock, self._session, site)
+            new_sender = SiteSender.for_hand(self._bus, self._clock, self._session, site)
             new_sender.number = 0  # the messages of a page are numbered from 1
             self._senders[site] = new_sender
         sender = self._senders[site]

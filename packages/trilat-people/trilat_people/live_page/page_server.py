@@ -43,11 +43,16 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.http11 import Request, Response
 
 from trilat_net.errors import UsageError, WireError, count_nouns
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_member_keys
-from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net import (
+    CERTIFICATE,
+    HERE,
+    PRIVATE_KEY,
+    Bus,
+    Clock,
+    ZenohBus,
+    read_member_keys,
+    topics,
+)
 from trilat_net.process import raise_priority
 
 from .page_entrance import Strangers, choose_page_to_close, is_full

@@ -25,22 +25,21 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.analysis.aligned import AlignedRecords
-from trilat_net.analysis.arm_rows import (
+from trilat_net.analysis import (
+    AlignedRecords,
+    BodyTurns,
     EndEffectorRows,
+    TorqueSplit,
     build_arm_rows,
     joint_positions_m,
+    list_walls,
     upright_axes,
+    wall_force,
 )
-from trilat_net.analysis.body_turns import BodyTurns
-from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
-from trilat_net.core.life.live_hand import HandInForce
-from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
-from trilat_net.core.step.vectors import Array
-from trilat_net.net.messages import Event
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.event_text import describe_event
-from trilat_net.scenario.laws import identify_law
+from trilat_net.core import Array, HandInForce, LifeAlarm
+from trilat_net.net import Event
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Scenario, describe_event, identify_law
 
 from .session_view import SessionView, SiteView, Tail
 
@@ -206,7 +205,7 @@ class _ArmFrames:
             synchronisation error, torque of a joint in N m, force of people in N, and force of
             the walls in N.
         """
-        split = split_torque(records, self._scenario)
+        split = TorqueSplit.of_records(records, self._scenario)
         hand_force = self._compute_hand_force(records, split)
         wall_force_n = self._compute_wall_force(records, split)
         error_norm = np.linalg.norm(records.e, axis=1)

@@ -23,26 +23,31 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from recorder.backfill import GapRepair
-from recorder.site_reception import AWAY_NS, InboundMessage, InboundQueue, SiteReception
-from trilat_net.analysis.certificate.running_energy import (
-    KEPT_S,
-    EnergyCourse,
-    RecordWindow,
-    RunningEnergy,
-)
-from trilat_net.core.life.live_hand import TAKEN
-from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm, find_alarm
+from recorder import AWAY_NS, GapRepair, InboundMessage, InboundQueue, SiteReception
+from trilat_net.analysis import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
+from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
-from trilat_net.net import topics
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.membership import MemberQuery
-from trilat_net.net.messages import Event, Info, LinkStats, State
-from trilat_net.net.wire import decode, split_states
-from trilat_net.scenario import Scenario, parse_core_change, parse_embedded
-from trilat_net.scenario.run_changes import LinkTables, find_requester
-from trilat_net.scenario.sample_uses import PictureDelay
+from trilat_net.net import (
+    Bus,
+    Clock,
+    Event,
+    Info,
+    LinkStats,
+    MemberQuery,
+    State,
+    decode,
+    split_states,
+    topics,
+)
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import (
+    LinkTables,
+    PictureDelay,
+    Scenario,
+    find_requester,
+    parse_core_change,
+    parse_embedded,
+)
 
 LATE_S = 3.0
 """An observer has joined late if the first record that it receives is of a later time, in s."""
@@ -180,7 +185,7 @@ class SiteView:
             lost_peers = self.layout.list_lost_peers(record.mem, self.peers)
         shared_coordinates = len(record.q_des)  # by which `mem` is divided
         # The function of the module `ticks`, which derives an alarm from a record alone.
-        alarm = find_alarm(
+        alarm = LifeAlarm.find(
             session=session,
             site=name,
             mode=record.mode,

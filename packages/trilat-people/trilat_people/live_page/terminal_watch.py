@@ -14,19 +14,11 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 
 from rich.console import Console
 
-from trilat_net.app.monitor import (
-    HEADS,
-    SessionDisplay,
-    SiteRow,
-    describe_angles,
-    describe_site,
-)
-from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
+from trilat_net.app import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
+from trilat_net.core import LifeAlarm
 from trilat_net.errors import SessionError
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection
-from trilat_net.net.discovery import connect_to_session
+from trilat_net.net import Bus, Clock, Connection, connect_to_session
+from trilat_net.records import NS_PER_S
 from trilat_net.scenario import embedded_names_reader, find_site
 from trilat_net.signals import Interrupt
 

@@ -51,10 +51,10 @@ from trilat_net.log.ros2.published import list_topics
 from trilat_net.log.ros2.robot_model import RobotModel
 from trilat_net.log.ros2.topic_names import (
     DIAGNOSTICS,
-    FRAMES,
+    FRAMES_TOPIC,
     TOPICS,
     RobotTable,
-    read_topic_table,
+    TopicTable,
 )
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
@@ -211,13 +211,13 @@ def test_the_table_of_topics_is_complete() -> None:
     names = [name for cell in first_cells for name in re.findall(r"`([^`]*)`", cell)]
     listed = {name.rpartition("/")[2] for name in names}
     accepted = {name for name in TOPICS if name.startswith(("target_", "set_", "robot_"))}
-    published = set(TOPICS) - accepted | {"robot_description", FRAMES, DIAGNOSTICS}
+    published = set(TOPICS) - accepted | {"robot_description", FRAMES_TOPIC, DIAGNOSTICS}
     assert listed == published | {"events", "log", "sent_..."}
 
 
 def test_topics_have_the_names_in_a_file(tmp_path: Path) -> None:
     (tmp_path / "names.toml").write_text(FILE)
-    table = read_topic_table(str(tmp_path / "names.toml"))
+    table = TopicTable.read(str(tmp_path / "names.toml"))
     assert table.find("play", "m1", "joint_states") == "play/m1/arm/joint_states"
     assert table.find("play", "m1", "target_pose") == "m1/goal"
     assert table.find("play", "s", "robot_states") == "joint_states"
@@ -226,8 +226,8 @@ def test_topics_have_the_names_in_a_file(tmp_path: Path) -> None:
         "s": RobotTable(["shoulder", "elbow"], ["elbow", "shoulder"], [0.0, 0.0]),
         "m1": RobotTable(),
     }
-    assert read_topic_table("crtk").find("play", "s", "target_pose") == "play/s/servo_cp"
-    assert read_topic_table("crisp").find("play", "s", "target_pose") == "play/s/target_pose"
+    assert TopicTable.read("crtk").find("play", "s", "target_pose") == "play/s/servo_cp"
+    assert TopicTable.read("crisp").find("play", "s", "target_pose") == "play/s/target_pose"
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_invalid_names_are_refused(tmp_path: Path, text: str | None, said: str) 
     if text is not None:
         file.write_text(text)
     with pytest.raises(UsageError, match=said.replace("--names", "names")):
-        read_topic_table(str(file))
+        TopicTable.read(str(file))
 
 
 @pytest.mark.parametrize("site", ["m", "nobody"])
@@ -273,7 +273,7 @@ def test_a_site_without_external_arm_takes_no_robot(tmp_path: Path, site: str) -
         UsageError,
         match=rf"sites\.{site}: no site of this name has an external arm; sites with an external arm: s",
     ):
-        refuse_other_robots(read_topic_table(str(tmp_path / "names.toml")), scenario)
+        refuse_other_robots(TopicTable.read(str(tmp_path / "names.toml")), scenario)
 
 
 def test_reasons_of_strangers_are_counted_but_not_kept() -> None:
@@ -345,7 +345,7 @@ def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
-        ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+        ends: Any = BridgeEnds(graph, None, None, "t", TopicTable.read("crisp"))  # type: ignore[arg-type]
         site_topics = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
         site_topics.publish(log[site].states[-1], 1000.0)
         messages = [
@@ -650,7 +650,7 @@ class Sites:
         )
         self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
         self._ends: Any = BridgeEnds(
-            self.graph, network.join(), SystemClock(), session, read_topic_table("crisp")
+            self.graph, network.join(), SystemClock(), session, TopicTable.read("crisp")
         )  # type: ignore[arg-type]
 
     def begin(self, epoch_unix_ns: int) -> None:
@@ -763,7 +763,7 @@ def test_bags_of_other_scenarios_share_no_topics(
 ) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.02})
     trilat_net.export(log, "ros2", tmp_path / "bag.mcap", names=naming)
-    graph, table = Listener(), read_topic_table(naming)
+    graph, table = Listener(), TopicTable.read(naming)
     ends: Any = BridgeEnds(graph, None, None, name, table)  # type: ignore[arg-type]
     for site in log.sites:
         SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
@@ -817,7 +817,7 @@ def list_rviz_topics(config: Path) -> dict[str, tuple[str, bool]]:
 def test_rviz_has_the_topics_of_the_live_bridge(tmp_path: Path, name: str, naming: str) -> None:
     scenario = load_scenario(name)
     graph = Listener()
-    ends: Any = BridgeEnds(graph, None, None, name, read_topic_table(naming))  # type: ignore[arg-type]
+    ends: Any = BridgeEnds(graph, None, None, name, TopicTable.read(naming))  # type: ignore[arg-type]
     for site in scenario.names:
         SiteTopics(ends, scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
     config = tmp_path / "view.rviz"

@@ -11,7 +11,7 @@ from trilat_studies.sweep.sweep_results import SweepResults, build_reproduce_com
 
 from tests.cli.running import trilat
 from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.run_end import classify_log_end
+from trilat_net.analysis.run_end import RunEnd
 from trilat_net.log.log_reader import open_log
 
 from .quick import SHORT, plan_quick_sweep
@@ -42,7 +42,7 @@ def test_command_of_cell_gives_its_numbers_bitwise(
         outcome = results.outcome(row)
         assert done.code == (0 if outcome.diverged_s is None else 1), done
         log = open_log(tmp_path / arguments[-1])
-        run_end = classify_log_end(log)
+        run_end = RunEnd.of_log(log)
         assert run_end.end_error_rad == outcome.end_error_rad
         assert run_end.end_speed_rad_s == outcome.end_speed_rad_s
         stability = certify_run(log).stability
@@ -69,7 +69,7 @@ def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: 
     arguments = shlex.split(command)
     trilat(*arguments[1:], cwd=tmp_path)
     assert (
-        classify_log_end(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad
+        RunEnd.of_log(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad
         == row["end_error_rad"]
     )
     source.rename(source.with_suffix(".away"))

@@ -28,11 +28,7 @@ from trilat_studies.sweep.sweep_plan import (
 )
 from trilat_studies.sweep.sweep_results import SweepResults
 
-from trilat_net.analysis.theory.linear_edge import (
-    GrowthColumn,
-    compute_growth_column,
-    iterate_linear_edges,
-)
+from trilat_net.analysis.theory.linear_edge import GrowthColumn, iterate_linear_edges
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -82,7 +78,7 @@ def test_short_delays_have_the_condition_as_line() -> None:
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
     scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
-        [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
+        [GrowthColumn.compute(scenarios, "control.d", damping.values)] * 2, damping
     )
     assert line is not None
     assert line.crossings(0, damping) == [pytest.approx(0.5, rel=0.02)]
@@ -95,7 +91,7 @@ def test_coarse_map_has_the_exact_linear_line() -> None:
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
     scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
-        [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
+        [GrowthColumn.compute(scenarios, "control.d", damping.values)] * 2, damping
     )
     edge = next(iterate_linear_edges(scenarios[0], "control.d", 0.2, 1.2), None)
     assert line is not None

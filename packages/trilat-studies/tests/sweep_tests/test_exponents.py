@@ -17,9 +17,9 @@ from trilat_studies.sweep.stability_map import (
 from trilat_studies.sweep.sweep_plan import build_sweep_command, plan_from_json, plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
 
-from trilat_net.analysis.theory.linear_edge import compute_growth_column
+from trilat_net.analysis.theory.linear_edge import GrowthColumn
 from trilat_net.errors import UsageError
-from trilat_net.presentation.appearance import make_print_size
+from trilat_net.presentation.appearance import FigureSize
 
 from .maps import KEYS, P_D, rows
 from .quick import plan_quick_sweep
@@ -58,7 +58,7 @@ def test_exponents_are_real_parts_of_rightmost_roots(results: SweepResults) -> N
             results.plan.scenario(f"link.delay_ms={delay_ms}", f"control.d={d}")
             for d in DAMPINGS
         ]
-        roots = compute_growth_column(scenarios, KEYS[1], DAMPINGS).growth_per_s
+        roots = GrowthColumn.compute(scenarios, KEYS[1], DAMPINGS).growth_per_s
         assert min(roots) < -0.01
         assert max(roots) > 0.01
         for row, root in zip(column, roots, strict=True):
@@ -89,7 +89,7 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
     shifted = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
     plane = build_plane(shifted, KEYS, P_D)
-    figure = draw_stability_map(plane, ((),), make_print_size(3.5))
+    figure = draw_stability_map(plane, ((),), FigureSize.for_print(3.5))
     mesh: Any = next(
         collection
         for collection in figure.axes[0].collections

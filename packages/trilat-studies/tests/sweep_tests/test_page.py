@@ -23,7 +23,7 @@ from trilat_studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, 
 from trilat_studies.sweep.sweep_cell import CellClass
 from trilat_studies.sweep.sweep_plan import plan_sweep
 
-from trilat_net.presentation.appearance import make_print_size
+from trilat_net.presentation.appearance import FigureSize
 
 from .maps import DAMPINGS, DELAYS_MS, judge_by_condition, make_plane, rows
 
@@ -113,7 +113,9 @@ LINE = MapLine("$d$", "d", "", SPARE, 0)
 
 
 def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = ()) -> Figure:
-    return draw_stability_map(plane, [lines] * len(plane.panels), make_print_size(width_in))
+    return draw_stability_map(
+        plane, [lines] * len(plane.panels), FigureSize.for_print(width_in)
+    )
 
 
 def meshes(made: Figure) -> list[QuadMesh]:
@@ -250,7 +252,7 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
     plane = make_plane(link__playout_ms=panels)
     figure = draw_stability_map(
-        plane, [()] * len(plane.panels), make_print_size(width_in), FIXED
+        plane, [()] * len(plane.panels), FigureSize.for_print(width_in), FIXED
     )
     figure.draw_without_rendering()
     (caption,) = figure.texts[:1]

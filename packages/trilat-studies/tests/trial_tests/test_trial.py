@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trilat_studies.run_commands import list_assignments
 from trilat_studies.trials import Trial, evaluate_live_log
 
 import trilat_net
 from tests.log_editing import edited, recorded, without
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import apply_overrides, load_scenario
-from trilat_net.work.study_folder import list_assignments
 
 from .results import TOO_MUCH, quick
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trilat_studies.run_commands import format_toml_value
 from trilat_studies.tuning.candidate import TuningScenario, load_tuning_scenario
 from trilat_studies.tuning.search_space import (
     DEFAULT_LAWS,
@@ -17,7 +18,6 @@ from trilat_studies.tuning.search_space import (
 from tests.core.chain_references import ChainState, chain_references
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-from trilat_net.work.study_folder import format_toml_value
 
 from .experiments import trio
 

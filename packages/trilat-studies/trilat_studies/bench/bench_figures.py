@@ -21,13 +21,11 @@ from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from trilat_net.analysis.run_end import Stability
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import Stability
+from trilat_net.core import Array
 from trilat_net.files import write_whole
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import make_print_size
-from trilat_net.work.intervals import MeanInterval
-from trilat_net.work.study_folder import encode_csv
+from trilat_net.presentation import FigureSize, style
+from trilat_net.work import MeanInterval, encode_csv
 
 from .bench_results import (
     BenchCellResult,
@@ -120,7 +118,7 @@ def _draw_bench(results: BenchResults, name: str) -> Figure:
         palette = colormaps[_PALETTE]
     law_counts = [len(field) for field in fields.values()]
     panels_height = sum(_HEAD_IN / 2 + _ROW_IN * count for count in law_counts)
-    size = make_print_size(_WIDTH_IN)
+    size = FigureSize.for_print(_WIDTH_IN)
     figure_height = panels_height + _HEAD_IN
     with style.styled_figure(size, figure_height) as figure:
         grid = style.add_panels(

@@ -34,12 +34,11 @@ import msgspec
 
 from trilat_net.errors import UsageError, suggest_nearest
 from trilat_net.files import write_whole
-from trilat_net.laws.six_channel import complementary_shares
-from trilat_net.scenario.laws import BUILT_IN
-from trilat_net.scenario.resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-from trilat_net.work.executor import Progress, Workers, ignore_progress
-from trilat_net.work.study_folder import format_toml_value
+from trilat_net.laws import complementary_shares
+from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
+from trilat_net.work import Progress, Workers, ignore_progress
 
+from ..run_commands import format_toml_value
 from ..tuning.candidate import (
     CandidateClass,
     TuningScenario,

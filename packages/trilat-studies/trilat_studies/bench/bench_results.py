@@ -19,12 +19,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis import EndBehaviour, Stability
 from trilat_net.errors import count_nouns
-from trilat_net.presentation.result_text import Block, TextTable, format_number
+from trilat_net.presentation import Block, TextTable, format_number
 from trilat_net.results import Result
-from trilat_net.work.intervals import MeanInterval, mean_interval, wilson_interval
-from trilat_net.work.study_folder import encode_csv
+from trilat_net.work import MeanInterval, encode_csv, wilson_interval
 
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
@@ -293,7 +292,7 @@ class BenchCellResult(NamedTuple):
         if None in values or self.masked:
             return None
         if len(values) >= LEAST_SEEDS:
-            return mean_interval(values)
+            return MeanInterval.of_values(values)
         return float(np.mean(values))
 
 

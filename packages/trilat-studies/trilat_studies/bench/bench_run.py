@@ -27,29 +27,36 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
-from trilat_net.analysis.judge import judge_virtual_run
-from trilat_net.analysis.run_end import THROWN_RAD, EndBehaviour, RunEnd, Stability
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
-from trilat_net.analysis.stability_decision import LoopRoots
-from trilat_net.analysis.torque_sources import list_walls, wall_force
-from trilat_net.analysis.twins.twin_growth import TwinGrowth
-from trilat_net.core.step.ticks import NS_PER_S
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import (
+    SETTLED_ERROR_RAD,
+    THROWN_RAD,
+    EndBehaviour,
+    LoopRoots,
+    RunEnd,
+    Stability,
+    TwinGrowth,
+    build_arm_rows,
+    judge_virtual_run,
+    list_walls,
+    plan_dominance,
+    wall_force,
+)
+from trilat_net.core import Array
 from trilat_net.errors import UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.kernel_operators import ViscousEnvironment
-from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
-from trilat_net.work.study_folder import (
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import Scenario, ViscousEnvironment
+from trilat_net.work import (
+    Progress,
     RunJournal,
     StudyFolder,
+    Workers,
     build_resume_hint,
-    describe_program,
+    ignore_progress,
+    open_worker_pool,
 )
 
-from ..measure_run import RecordBatch, run_whole
+from ..measure_run import RecordBatch, describe_program, run_whole
 from ..tuning.candidate import load_tuning_scenario
 from .bench_plan import (
     SHORTER_REACH,
@@ -715,9 +722,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    period_s = 1.0 / scenario.sites[SLAVE].rate_hz
-    start, ramps = list_scripted_ramps(scenario, SLAVE)
-    alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha  # dominance factors
+    alpha = plan_dominance(scenario, SLAVE, t_s)
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]

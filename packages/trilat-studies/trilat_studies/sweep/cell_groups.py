@@ -16,8 +16,7 @@ from math import prod
 from typing import NamedTuple
 
 from trilat_net.errors import ScenarioError, count_nouns
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.lanes import describe_structure
+from trilat_net.execution import FusedRun, describe_structure
 
 from . import sweep_cell
 from .sweep_plan import SweepPlan, spread_indices

@@ -16,10 +16,8 @@ from typing import Any
 import msgspec
 
 from trilat_net.errors import ScenarioError
-from trilat_net.own_code.imported_code import ImportedLaw, read_code
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.describe import describe_value
-from trilat_net.scenario.laws import identify_law
+from trilat_net.own_code import ImportedLaw, read_code
+from trilat_net.scenario import Scenario, describe_value, identify_law
 
 from .sweep_plan import SweepPlan
 

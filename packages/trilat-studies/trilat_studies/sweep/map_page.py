@@ -38,12 +38,10 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import count_nouns
 from trilat_net.files import write_whole
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import COLUMN_IN, FigureSize, make_print_size
-from trilat_net.presentation.result_text import TextTable
+from trilat_net.presentation import COLUMN_IN, FigureSize, TextTable, style
 
 from .fixed_gains import FAIR_COMPARISON
 from .stability_map import (
@@ -731,7 +729,7 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
         UsageError: A figure in print cannot have this width. It must be as wide as one or two
             columns of a page.
     """
-    form = make_print_size(width_in)
+    form = FigureSize.for_print(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
     picture_names = ("map.png", "map.svg", "map.pdf")
     picture_paths = [folder / name for name in picture_names]

@@ -22,14 +22,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis.theory.linear_edge import find_root_crossings
+from trilat_net.analysis import find_root_crossings
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
-from trilat_net.own_code.code_consent import list_imported_code
-from trilat_net.presentation.result_text import TextTable
+from trilat_net.own_code import list_imported_code
+from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains

@@ -35,19 +35,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.analysis.arm_rows import PlacedArm
-from trilat_net.analysis.theory.linear_edge import GrowthColumn, compute_growth_column
-from trilat_net.core.step.vectors import Array
+from trilat_net.analysis import GrowthColumn, PlacedArm
+from trilat_net.core import Array
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.laws.adaptive import Adaptive
-from trilat_net.laws.conditions import COMMON_MOTION_SHARE, find_least_reversible
-from trilat_net.laws.p_d import PD
-from trilat_net.scenario import Scenario, SiteSpec
-from trilat_net.scenario.arms import ArmModel
-from trilat_net.scenario.delay_models import LinkBase
-from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
-from trilat_net.scenario.key_checks import is_number
-from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive, find_least_reversible
+from trilat_net.scenario import (
+    ArmModel,
+    ConstantDelay,
+    LinkBase,
+    NoDelay,
+    Scenario,
+    SiteSpec,
+    is_number,
+)
+from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 
 from .fixed_gains import describe_fixed_gains
 from .sweep_cell import RUN_CLASSES, CellClass
@@ -1414,7 +1415,7 @@ def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
     """
     load, x, y = task
     scenarios = [load(x, y_value) for y_value in y.values]
-    return compute_growth_column(scenarios, y.key, y.values)
+    return GrowthColumn.compute(scenarios, y.key, y.values)
 
 
 def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:

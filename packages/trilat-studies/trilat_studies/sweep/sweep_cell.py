@@ -21,19 +21,24 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis.judge import judge_virtual_run
-from trilat_net.analysis.run_end import EndBehaviour, RunTrace, Stability, classify_run_end
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
-from trilat_net.analysis.theory.linear_edge import compute_growth_column
-from trilat_net.analysis.theory.loop_roots import find_run_roots
-from trilat_net.analysis.twins.twin_growth import measure_virtual_twins
-from trilat_net.execution.fused import FusedRun, RunTotals, check_fusable
+from trilat_net.analysis import (
+    SETTLED_ERROR_RAD,
+    EndBehaviour,
+    GrowthColumn,
+    RunTrace,
+    Stability,
+    TwinGrowth,
+    find_run_roots,
+    judge_virtual_run,
+)
+from trilat_net.execution import FusedRun, RunTotals, check_fusable
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.validate import refuse_live_only
+
+from ..measure_run import refuse_live_only
 
 if TYPE_CHECKING:
-    from trilat_net.execution.lanes import RunGroup
+    from trilat_net.execution import RunGroup
 
 
 class CellClass(StrEnum):
@@ -313,7 +318,7 @@ def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCe
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution.lanes import group_runs
+    from trilat_net.execution import group_runs
 
     cells = [_CellInProgress(parse_scenario(text), longest_s) for text in texts]
     runs = [cell.run for cell in cells]
@@ -371,8 +376,8 @@ def measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
-    twins = measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
 
@@ -385,7 +390,7 @@ def judge_linearly(scenario: Scenario) -> CellResult:
     Args:
         scenario: Scenario of the cell.
     """
-    column = compute_growth_column([scenario], "", [0.0], at_mean_pose=True)
+    column = GrowthColumn.compute([scenario], "", [0.0], at_mean_pose=True)
     (rate_per_s,) = column.growth_per_s
     remarks = "; ".join(column.remarks)
     if math.isnan(rate_per_s):
@@ -487,7 +492,7 @@ def _build_result(
         totals: Totals over the scenario's duration, without extensions.
         extended: Number of times that the duration was doubled.
     """
-    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
     return CellResult(
         verdict=classify_decision(end.stability, end.behaviour),
         motion=end.behaviour,

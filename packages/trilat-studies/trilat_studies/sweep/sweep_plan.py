@@ -25,17 +25,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis.metrics.log_metrics import find_quantity
+from trilat_net.analysis import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
 from trilat_net.fields import split_unit
-from trilat_net.own_code.code_consent import allow_own_code
-from trilat_net.own_code.imported_code import name_law_classes
-from trilat_net.scenario import Scenario, apply_overrides
-from trilat_net.scenario.key_checks import is_number
-from trilat_net.scenario.laws import LAWS, identify_law
-from trilat_net.scenario.scenario_reader import ExperimentText, read_experiment
-from trilat_net.work.study_folder import format_command, format_toml_value, set_options
+from trilat_net.own_code import allow_own_code, name_law_classes
+from trilat_net.scenario import (
+    LAWS,
+    ExperimentText,
+    Scenario,
+    apply_overrides,
+    identify_law,
+    is_number,
+)
 
+from ..run_commands import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")
@@ -492,7 +495,7 @@ def plan_sweep(
         ScenarioError: The scenario, an axis or a value of an axis is not valid or cannot run.
         UsageError: Another argument is not valid.
     """
-    written = read_experiment(source)
+    written = ExperimentText.read(source)
     texts = tuple(overrides)
     axes = tuple(map(parse_axis, list_axes(over)))
     law_list = [laws] if isinstance(laws, str | type) else laws

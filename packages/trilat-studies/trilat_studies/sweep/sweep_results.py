@@ -29,15 +29,15 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis.metrics.log_metrics import find_quantity
+from trilat_net.analysis import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
-from trilat_net.execution.fused import RunTotals
+from trilat_net.execution import RunTotals
 from trilat_net.files import write_whole
 from trilat_net.results import Result
-from trilat_net.scenario.scenario_reader import read_source
-from trilat_net.work.intervals import MeanInterval, mean_interval, wilson_interval
-from trilat_net.work.study_folder import format_command, set_options
+from trilat_net.scenario import read_source
+from trilat_net.work import MeanInterval, wilson_interval
 
+from ..run_commands import format_command, set_options
 from .result_table import (
     ResultRow,
     ResultTable,
@@ -375,7 +375,7 @@ def iterate_grid_points(results: SweepResults) -> Iterator[GridPoint]:
         means = []
         for key in totals:
             values = [row.get(key) for row in rows_within_limits]
-            means.append(mean_interval(values))
+            means.append(MeanInterval.of_values(values))
         class_counts = [counts[verdict.value] for verdict in RUN_CLASSES]
         yield GridPoint(
             cell=cell,

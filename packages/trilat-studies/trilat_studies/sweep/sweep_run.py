@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis.metrics.log_metrics import measure_run
+from trilat_net.analysis import measure_run
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -34,22 +34,24 @@ from trilat_net.errors import (
     count_nouns,
     format_wall_time,
 )
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution import FusedRun, simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
-from trilat_net.net.clock import SystemClock
-from trilat_net.own_code.code_consent import list_imported_code
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.laws import identify_law
-from trilat_net.work import executor
-from trilat_net.work.study_folder import (
+from trilat_net.net import SystemClock
+from trilat_net.own_code import list_imported_code
+from trilat_net.scenario import Scenario, identify_law
+from trilat_net.work import (
+    Progress,
     RunJournal,
     StudyFolder,
+    WorkerPool,
+    Workers,
     build_resume_hint,
-    describe_program,
+    ignore_progress,
+    open_worker_pool,
 )
 from trilat_net.workers import count_cores
 
+from ..measure_run import describe_program
 from . import sweep_cell
 from .cell_groups import find_cell_groups
 from .edge_refinement import NOT_KNOWN, EdgeRefinement, choose_side
@@ -455,7 +457,7 @@ def _compile_lanes(plan: SweepPlan) -> None:
     Args:
         plan: The sweep. The code is that of its first cell.
     """
-    from trilat_net.execution.lanes import group_runs
+    from trilat_net.execution import group_runs
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
@@ -563,9 +565,9 @@ def refuse_oversized_sweep(
 def run_sweep(
     folder: SweepFolder,
     jobs: int | None = None,
-    progress: executor.Progress = executor.ignore_progress,
+    progress: Progress = ignore_progress,
     known: Iterable[CellRun] = (),
-    on: executor.Workers = None,
+    on: Workers = None,
 ) -> FinishedSweep:
     """Runs the remaining runs of a sweep, and writes the results into its folder.
 
@@ -594,9 +596,7 @@ def run_sweep(
         left = plan.cells * len(plan.seeds) - len(journal.done)
         laws = list_imported_code([plan.base])
         workers = on if left else None  # no cluster is needed if nothing is left to run
-        with executor.open_worker_pool(
-            jobs, workers, most=left, laws=laws, hint=_RESUME_HINT
-        ) as pool:
+        with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers
             _SweepWork(plan, journal, pool, progress, tally).execute()
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
@@ -689,8 +689,8 @@ class _SweepWork:
         self,
         plan: SweepPlan,
         journal: RunJournal[CellRun],
-        pool: executor.WorkerPool,
-        progress: executor.Progress,
+        pool: WorkerPool,
+        progress: Progress,
         tally: _NewRuns,
     ) -> None:
         self._plan = plan

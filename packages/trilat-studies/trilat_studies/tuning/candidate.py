@@ -44,30 +44,35 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.dominance_history import (
-    evaluate_ramps,
+from trilat_net.analysis import (
+    SETTLED_ERROR_RAD,
+    EndBehaviour,
+    RunEnd,
+    Stability,
+    build_arm_rows,
+    compute_target_motion,
     find_closed_groups,
+    find_hanging_sites,
     left_perron_vector,
-    list_scripted_ramps,
+    plan_dominance,
 )
-from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
-from trilat_net.analysis.torque_sources import compute_target_motion
-from trilat_net.core.step.ticks import NS_PER_S
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array
 from trilat_net.errors import ScenarioError
-from trilat_net.laws.interface import LawSettings, TuningRun
-from trilat_net.log.log_reader import Log
-from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.expect import END_WINDOW_S
-from trilat_net.scenario.operators.kernel_operators import JointSpring, Wall
-from trilat_net.scenario.scenario_reader import ExperimentText, read_experiment
-from trilat_net.scenario.validate import refuse_live_only
-from trilat_net.work.intervals import mean_interval
-from trilat_net.work.study_folder import format_command, format_toml_value, set_options
+from trilat_net.laws import LawSettings, TuningRun
+from trilat_net.log import Log
+from trilat_net.records import NS_PER_S
+from trilat_net.scenario import (
+    END_WINDOW_S,
+    ExperimentText,
+    JointSpring,
+    Scenario,
+    Wall,
+    parse_scenario,
+)
+from trilat_net.work import MeanInterval
 
-from ..measure_run import RecordBatch, run_whole
+from ..measure_run import RecordBatch, refuse_live_only, run_whole
+from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02
@@ -465,7 +470,7 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
     means = {}
     for field in _AVERAGED:
         values = [getattr(score, field) for score in scores]
-        interval = mean_interval(values)
+        interval = MeanInterval.of_values(values)
         intervals[field] = interval
         means[field] = None if interval is None else interval.mean
     error = intervals["error_rad"]
@@ -609,10 +614,8 @@ def _compute_promised_motion(
         return None
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
-        start, ramps = list_scripted_ramps(scenario, name)
-        period_s = 1.0 / scenario.sites[name].rate_hz
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = evaluate_ramps(start, ramps, t_s, period_s).alpha
+        alpha[:, site, peers] = plan_dominance(scenario, name, t_s)
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 
@@ -858,6 +861,6 @@ def load_tuning_scenario(
     Raises:
         ScenarioError: The scenario does not exist, or is not valid with the overrides.
     """
-    experiment = read_experiment(source)
+    experiment = ExperimentText.read(source)
     scenario = experiment.load(overrides)
     return TuningScenario(experiment, tuple(overrides), scenario)

@@ -23,26 +23,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis.arm_rows import build_arm_rows
+from trilat_net.analysis import build_arm_rows
 from trilat_net.errors import ScenarioError, UsageError, suggest_nearest
 from trilat_net.fields import MAX_QUANTITY
-from trilat_net.laws.interface import (
-    DAMPING,
-    ERROR_DAMPING,
-    ControlLaw,
-    GainRange,
-    TuningSite,
-)
-from trilat_net.own_code.imported_code import (
-    CodeConsent,
-    CodeKey,
-    allowed_code,
-    import_class,
-    read_code,
-)
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.key_checks import is_number
-from trilat_net.scenario.laws import BUILT_IN
+from trilat_net.laws import DAMPING, ERROR_DAMPING, ControlLaw, GainRange, TuningSite
+from trilat_net.own_code import CodeConsent, CodeKey, allowed_code, import_class, read_code
+from trilat_net.scenario import BUILT_IN, Scenario, is_number
 
 MIN_BOX = 0.1
 """Least half width of a box of estimates, as a fraction of the estimated parameter."""

@@ -30,15 +30,14 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from trilat_net.core.step.jit import is_core_cached
-from trilat_net.core.step.vectors import Array
+from trilat_net.core import Array, is_core_cached
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
-from trilat_net.execution.fused import FusedRun
-from trilat_net.net.clock import SystemClock
-from trilat_net.own_code.imported_code import name_law_classes
+from trilat_net.execution import FusedRun
+from trilat_net.net import SystemClock
+from trilat_net.own_code import name_law_classes
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 from trilat_net.workers import count_cores
 
 from .candidate import (

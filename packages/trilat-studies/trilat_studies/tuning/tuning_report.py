@@ -25,14 +25,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from trilat_net.analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING
+from trilat_net.analysis import NEGATIVE_ENERGY_MEANING
 from trilat_net.errors import count_nouns
 from trilat_net.files import write_whole
-from trilat_net.presentation import style
-from trilat_net.presentation.appearance import REPORT_SIZE, SITE_COLOURS
-from trilat_net.presentation.result_text import Block, TextTable, format_number
-from trilat_net.scenario.laws import BUILT_IN
-from trilat_net.work.intervals import MeanInterval
+from trilat_net.presentation import (
+    REPORT_SIZE,
+    SITE_COLOURS,
+    Block,
+    TextTable,
+    format_number,
+    style,
+)
+from trilat_net.scenario import BUILT_IN
+from trilat_net.work import MeanInterval
 
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints

@@ -25,24 +25,36 @@ from typing import Any, NamedTuple
 import msgspec
 
 from .. import process
-from ..core.plug.law_channel import LawChannel
-from ..core.step.fingerprint import compute_fingerprint
-from ..core.step.recorded_ticks import TickRepeater
-from ..core.step.site_arrays import MAX_RAMPS
-from ..core.step.site_setup import StaleAction
-from ..core.step.site_step import Site
-from ..core.step.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput, TickRecord
+from ..core import (
+    MAX_ARRIVALS,
+    MAX_RAMPS,
+    CoreChange,
+    LawChannel,
+    PlantState,
+    Site,
+    StaleAction,
+    TickInput,
+    TickRepeater,
+    compute_fingerprint,
+)
 from ..errors import LawFailed, ScenarioError
 from ..files import digest_file
-from ..log.accounting import MIN_COVERAGE, Coverage
-from ..log.log_reader import Log, open_log
-from ..log.mcap_reader import Progress
-from ..log.running_digest import Integrity
-from ..log.session_check import judge_integrity
-from ..log.site_log import LazyRecords, RecordsByTick, SiteLog
-from ..net.messages import MODE_WORDS, STATE_VECTORS, State
-from ..own_code.code_consent import find_user_laws
+from ..log import (
+    MIN_COVERAGE,
+    Coverage,
+    Integrity,
+    LazyRecords,
+    Log,
+    Progress,
+    RecordsByTick,
+    SiteLog,
+    judge_integrity,
+    open_log,
+)
+from ..net import MODE_WORDS, STATE_VECTORS, State
+from ..own_code import find_user_laws
 from ..recorded_change import count_skipped_ticks
+from ..records import TickRecord
 from ..scenario import parse_core_change
 from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable, can_repeat, make_sample_table
 from .resumption import ArrivalEntry, RecordedInputs, read_output

@@ -28,8 +28,7 @@ from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError, count_nouns
 from ..files import describe_write_error, open_regular
-from ..net import topics
-from ..net.messages import VERSION, json_schema
+from ..net import VERSION, json_schema, topics
 from ..results import Result
 from ..scenario import parse_embedded
 from . import mcap_records

@@ -27,25 +27,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import process
-from ..core.step.fingerprint import compute_fingerprint
-from ..core.step.ticks import NS_PER_S, Mode
-from ..core.step.vectors import Array
+from ..core import Array, compute_fingerprint
 from ..errors import LogError, count_nouns
 from ..files import digest_file
 from ..hooks import find_hook
-from ..log.log_file import LogFile
-from ..log.log_layout import EXECUTED_SITES_KEY, MAX_TIME_NS, RERUN_DRIVER
-from ..log.log_reader import Log, open_log
-from ..log.log_writer import LogWriter
-from ..log.mcap_reader import Progress
-from ..log.mcap_writer import Sink
-from ..log.provenance import collect_provenance
-from ..log.record_columns import Ints
-from ..log.site_log import SiteLog
-from ..log.view_rates import VIZ_HZ
-from ..net.messages import READABLE, State
-from ..net.wire import decode
-from ..own_code.code_consent import find_user_laws
+from ..log import (
+    EXECUTED_SITES_KEY,
+    MAX_TIME_NS,
+    RERUN_DRIVER,
+    VIZ_HZ,
+    Ints,
+    Log,
+    LogFile,
+    LogWriter,
+    Progress,
+    Sink,
+    SiteLog,
+    collect_provenance,
+    open_log,
+)
+from ..net import READABLE, State, decode
+from ..own_code import find_user_laws
+from ..records import NS_PER_S, Mode
 from ..results import Result, finite_or_none
 from .rerun_execution import (
     RerunExecution,
@@ -57,7 +60,7 @@ from .rerun_execution import (
     resolve_rerun_request,
 )
 from .resumption import read_output
-from .verify import RecordDifference
+from .verification import RecordDifference
 from .virtual import SiteChannels, SiteEntry, render_accounts
 
 

@@ -20,19 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from ..analysis.judge import certify_run
-from ..analysis.site_signals import find_error_of_last_second
+from ..analysis import JointError, certify_run
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
-from ..execution.log_checks import check_log_files
-from ..execution.virtual_comparison import simulate_without_operators
-from ..log.accounting import MIN_COVERAGE
-from ..log.findings import CheckReport, Finding
-from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from ..log.site_log import SiteLog
-from ..own_code.code_consent import may_run_user_laws
-from ..own_code.imported_code import allowed_code
-from ..scenario.expect import END_WINDOW_S
+from ..execution import check_log_files, simulate_without_operators
+from ..log import MIN_COVERAGE, CheckReport, Finding, Log, Progress, SiteLog
+from ..own_code import allowed_code, may_run_user_laws
+from ..scenario import END_WINDOW_S
 from ..workers import worker_pool
 from . import terminal_output
 from .certificate_text import (
@@ -274,7 +267,7 @@ def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
         ticks = max(log.last_ticks[site], records.last_tick) + 1
         missing = ticks - len(records) - log.absent_ticks(site)
         times = _list_timing_cells(records) if is_timed else []
-        error = find_error_of_last_second(records)
+        error = JointError.find_in_last_second(records)
         cells = ["", ""]
         if error is not None:
             cells = [f"{error.value:.3g}", error.joint.removeprefix(f"{site} ")]

@@ -1,0 +1,79 @@
+"""Writes the overrides of a scenario as text, and the command that repeats a run of a study."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import tomli_w
+
+from trilat_net.errors import ScenarioError, join_arguments
+from trilat_net.own_code import name_law_classes
+from trilat_net.scenario import is_distribution
+
+
+def format_command(*arguments: str) -> str:
+    """Returns a command that a user can paste into a shell: "trilat sim 'my run.toml'".
+
+    Arguments with spaces or special characters are quoted. The word "trilat" is put first.
+    """
+    return join_arguments(["trilat", *arguments])
+
+
+def set_options(overrides: Iterable[str]) -> list[str]:
+    """Returns the command-line options --set that apply overrides of a scenario.
+
+    Args:
+        overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
+
+    Returns:
+        The arguments "--set" and KEY=VALUE, in turn.
+    """
+    arguments = []
+    for text in overrides:
+        arguments += ["--set", text]
+    return arguments
+
+
+def format_toml_value(value: Any) -> str:
+    """Returns a value as TOML on one line, for commands and overrides.
+
+    A number is written as short as possible, if it still parses back to the same number.
+
+    Args:
+        value: A number, text, list or table.
+
+    Raises:
+        ScenarioError: TOML cannot express the value.
+    """
+    value = name_law_classes(value)
+    if isinstance(value, Mapping):
+        entries = []
+        for key, entry in value.items():
+            entry_text = format_toml_value(entry)
+            entries.append(f"{key} = {entry_text}")
+        return f"{{{', '.join(entries)}}}"
+    if isinstance(value, list | tuple):
+        items = map(format_toml_value, value)
+        return f"[{', '.join(items)}]"
+    if isinstance(value, float) and float(f"{value:g}") == value:
+        return f"{value:g}"
+    try:
+        assignment = tomli_w.dumps({"v": value})
+        return assignment.removeprefix("v = ").removesuffix("\n")
+    except TypeError:
+        raise ScenarioError(
+            f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
+        ) from None
+
+
+def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the overrides of a nested mapping as texts KEY=VALUE, as on the command line.
+
+    Args:
+        overrides: Values by key, also as nested tables.
+        prefix: Keys of the enclosing tables, each followed by a dot.
+    """
+    for key, value in overrides.items():
+        if isinstance(value, Mapping) and not is_distribution(value):
+            yield from list_assignments(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}={format_toml_value(value)}"
