@@ -72,7 +72,7 @@ for axes in (top, middle, bottom):
 figure.suptitle(f"{slave} in {log.session['scenario']}")
 figure.savefig("look_into_a_log.png", dpi=150)
 
-# %% The same signals as a data frame; this needs polars: pip install 'trilat-net[frames]'
+# %% The same signals as a data frame; this needs polars: make extras EXTRAS=frames
 try:
     import polars as pl
 except ImportError:

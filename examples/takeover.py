@@ -7,12 +7,12 @@ once, and moves to the goal. For twenty goals, the example prints
 
 - success: how often the slave stays within 5 cm of its goal in the last second;
 - jump: the largest step of a reference while the lead changes, divided by the largest step of
-  the motion itself;
+  the motion itself; none if the lead does not change;
 - without control: the time in which the slave did not follow anybody.
 
 It takes about a minute:
 
-    pip install 'trilat-net[gym]'
+    make extras EXTRAS=gym  # after the first release: pip install 'trilat-net[gym]'
     python examples/takeover.py
 """
 
@@ -89,6 +89,15 @@ def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float
     }
 
 
+def describe_jump(runs: list[dict[str, float]]) -> str:
+    """Returns the mean jump of some runs and its interval, or "none" if no lead changed."""
+    jumps = np.array([result["jump"] for result in runs])
+    if np.isnan(jumps).all():
+        return "none"
+    mean, low, high = interval(jumps)
+    return f"{mean:.2f} [{low:.2f}, {high:.2f}]"
+
+
 def main() -> None:
     """Trains the policy, simulates all goals, and prints the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -100,12 +109,11 @@ def main() -> None:
         runs = [run(weights, seed, ramp_s) for seed in range(options.goals)]
         success = interval(np.array([result["success"] for result in runs]))
         distance = interval(np.array([result["distance_mm"] for result in runs]))
-        jump = interval(np.array([result["jump"] for result in runs]))
         without_s = max(result["without_control_s"] for result in runs)
         print(
             f"  {name:<14}  success {success[0]:.2f} [{success[1]:.2f}, {success[2]:.2f}]"
             f"  distance {distance[0]:.1f} mm [{distance[1]:.1f}, {distance[2]:.1f}]"
-            f"  jump {jump[0]:.2f} [{jump[1]:.2f}, {jump[2]:.2f}]"
+            f"  jump {describe_jump(runs)}"
             f"  without control {without_s:g} s"
         )
 

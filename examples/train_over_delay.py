@@ -6,9 +6,8 @@ that neither has seen. The result is the distance of the slave from its goal, or
 from its goal, with 95 % intervals over the seeds. A task takes at most ten minutes on two
 cores:
 
-    pip install 'trilat-net[gym]'
+    make extras EXTRAS=gym,sim  # after the first release: pip install 'trilat-net[gym,sim]'
     python examples/train_over_delay.py --out policies.png
-    pip install 'trilat-net[sim]'
     python examples/train_over_delay.py --task box --out box.png
 """
 
@@ -167,7 +166,8 @@ def play(env: Any, weights: np.ndarray, seed: int) -> float:
             slave_q=observation["peer_q"][1],
             slave_qd=observation["peer_qd"][1],
         )
-        observation, reward, ended, _, info = env.step(action)
+        within = np.clip(action, env.action_space.low, env.action_space.high)
+        observation, reward, ended, _, info = env.step(within)
         total -= reward - float(info["success"])
         if ended and not info["success"]:
             return EPISODE_S  # an episode that ends early without success costs most

@@ -3,7 +3,10 @@ stated reason.
 """
 
 import re
+import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -15,6 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 import tomli_w
 from latex2mathml.converter import convert
@@ -219,6 +223,7 @@ COMMAND_PAGES = {
     "docs/reference/links.md",
     "docs/studies/linear.md",
     "docs/overview.md",
+    "docs/studies/policies.md",
     "docs/reference/metrics.md",
     "docs/reference/silent-peers.md",
     "docs/reference/stability.md",
@@ -254,6 +259,9 @@ def prepare(page: str, folder: Path) -> None:
         session = folder / "runs" / "play-001"
         session.mkdir(parents=True)
         trilat("sim", "play", "--duration", "3", "-o", "run.mcap", cwd=session).succeeds()
+    if page == "docs/studies/policies.md":
+        (code, *_) = find_blocks(page)
+        (folder / "my_policy.py").write_text(code.text)
     if page == "docs/extend/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/extend/arms.md":
@@ -429,6 +437,31 @@ def list_shown(page: str) -> list[str]:
         ):
             output_lines += after.text.splitlines()
     return output_lines
+
+
+@pytest.mark.long
+def test_simulated_episodes_become_a_table(tmp_path: Path) -> None:
+    """The commands of the section run as written, in an empty folder."""
+    (block,) = (
+        block
+        for block in find_blocks("docs/studies/lerobot.md")
+        if block.text.startswith("$ mkdir episodes")
+    )
+    script = re.sub(r"^\$ ", "", block.text, flags=re.MULTILINE)
+    program = shlex.quote(sys.executable)
+    functions = f'trilat() {{ {program} -m trilat_net "$@"; }}; python() {{ {program} "$@"; }}'
+    done = subprocess.run(
+        ["bash", "-ec", f"{functions}\n{script}"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "'age_s.m1'" in done.stdout
+    frames = pl.read_parquet(tmp_path / "simulated" / "data" / "chunk-000" / "file-000.parquet")
+    largest = frames.group_by("episode_index", maintain_order=True).agg(pl.max("age_s.m1"))
+    assert largest["age_s.m1"].to_list() == pytest.approx([0.1, 0.2, 0.3, 0.4], abs=2e-3)
 
 
 @pytest.mark.long

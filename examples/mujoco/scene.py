@@ -1,6 +1,6 @@
 """Simulates an arm in MuJoCo that touches a box, a door with a spring, or a slot.
 
-    pip install 'trilat-net[sim]'
+    make extras EXTRAS=sim  # after the first release: pip install 'trilat-net[sim]'
     cd examples/mujoco
     trilat sim push.toml -o push.mcap  # or: trilat demo push.toml
     trilat report push.mcap
@@ -19,7 +19,7 @@ import trilat_net as tn
 try:
     import mujoco
 except ImportError:
-    raise ImportError("this plant needs MuJoCo: pip install 'trilat-net[sim]'") from None
+    raise ImportError("this plant needs MuJoCo: make extras EXTRAS=sim") from None
 
 THINGS = ("nothing", "box", "door", "slot")
 SIZES_M = {

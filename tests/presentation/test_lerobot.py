@@ -32,7 +32,9 @@ USERS = {
     "tau_x.a": 2,
     "tau_x.b": 2,
     "dominance": 2,
+    "age_s": 2,
 }
+AGES = ("age_s.a", "age_s.b")
 PLACES = {"frame_index", "episode_index", "index", "task_index"}
 
 
@@ -93,6 +95,7 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
     schema = pq.read_schema(folder / "data" / FILE)
     wanted = {name: pa.list_(pa.float32(), size) for name, size in USERS.items()}
     wanted |= {"observation.state": pa.list_(pa.float32(), 4), "timestamp": pa.float32()}
+    wanted |= dict.fromkeys(AGES, pa.float32())
     wanted |= {"next.done": pa.bool_(), **dict.fromkeys(PLACES, pa.int64())}
     assert {field.name: field.type for field in schema} == wanted
     assert set(info_text["features"]) == set(wanted)
@@ -102,6 +105,8 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
         "names": ["c.q1.pos", "c.q2.pos", "c.q1.vel", "c.q2.vel"],
     }
     assert info_text["features"]["dominance"]["names"] == ["a", "b"]
+    assert info_text["features"]["age_s"]["names"] == ["a", "b"]
+    assert info_text["features"]["age_s.b"]["names"] == ["c"]
     assert info_text["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
 
 
@@ -123,6 +128,31 @@ def test_frames_have_the_newest_earlier_records(fps: int, tmp_path: Path) -> Non
     assert state.sum() == frames["observation.state"].to_numpy().sum() != 0.0
     assert frames["timestamp"].to_list() == pytest.approx([n / fps for n in range(6 * fps)])
     assert frames["index"].to_list() == frames["frame_index"].to_list() == list(range(6 * fps))
+
+
+def test_sample_ages_follow_the_drawn_delay(tmp_path: Path) -> None:
+    """The age of a sample is the delay of its link, up to a tick, and grows until the first one."""
+    delays_ms = (60.0, 240.0)
+    runs = [
+        trilat_net.simulate("paper", {"link.delay_ms": delay_ms}, duration_s=0.6)
+        for delay_ms in delays_ms
+    ]
+    folder = exported(tmp_path, *runs)
+    frames = read(folder)
+    tick_s = 1e-3
+    for episode, delay_ms in enumerate(delays_ms):
+        rows = frames.filter(pl.col("episode_index") == episode)
+        times_s = rows["timestamp"].to_numpy()
+        delay_s = 1e-3 * delay_ms
+        for key in ("age_s.m1", "age_s.m2"):
+            assert np.allclose(
+                rows[key].to_numpy(), np.minimum(times_s, delay_s), atol=1.5 * tick_s
+            ), key
+        both = rows["age_s"].to_numpy()
+        assert np.allclose(both.T, np.minimum(times_s, delay_s), atol=1.5 * tick_s)
+    stats = info(folder, "meta/stats")
+    assert stats["age_s"]["max"] == pytest.approx([0.24, 0.24], abs=tick_s)
+    assert np.isfinite(stats["age_s.m2"]["mean"]).all()
 
 
 def test_users_above_the_programs_share_intervene(tmp_path: Path) -> None:

@@ -7,7 +7,11 @@ import trilat_net
 from tests.scenario.chains import six
 from tests.unit_arm import unit_scenario
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.describe import compare_scenarios, describe_scenario
+from trilat_net.scenario.describe import (
+    compare_scenarios,
+    describe_scenario,
+    describe_value,
+)
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
 from trilat_net.scenario.rest_bounds import find_rest_bounds
 
@@ -244,3 +248,17 @@ def test_conditions_need_exact_gravity(law: str, gravity: float) -> None:
     changes = {"control.law": law, "control.gravity": gravity}
     lines = describe_scenario(load_scenario("p_d_margin_two", changes))
     assert any(line.startswith("condition of") for line in lines) == (gravity == 1.0)
+
+
+def test_long_values_end_with_whole_entries() -> None:
+    """Of a hand with many settings the leading ones are shown, and eight digits of a hash."""
+    hand = {"kind": "own", "class": "my_policy:Reach", "source_sha256": "0123456789abcdef" * 4}
+    assert describe_value([hand]) == "[own class my_policy:Reach source_sha256 01234567]"
+    settings = {f"setting_{n}": 1.5 for n in range(9)}
+    words = describe_value([{**hand, **settings}]).strip("[]").split()
+    assert words[-1] == "..."
+    assert words[-2] == "1.5"
+    assert len(words) < 12
+    numbers = describe_value([n + 0.125 for n in range(40)]).strip("[]").split(", ")
+    assert numbers[:-1] == [f"{n + 0.125:g}" for n in range(len(numbers) - 1)]
+    assert numbers[-1] == "..."

@@ -562,6 +562,8 @@ _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites"
 """Keys that describe an experiment, or that are compared separately."""
 _MAX_VALUE_LENGTH = 80
 """Largest length of the text of a value."""
+_HASH_DIGITS = 8
+"""Number of digits of a SHA-256 hash that the text of a value shows."""
 
 
 _EVERY_LINK = "every link"
@@ -705,10 +707,29 @@ def describe_law(control: Mapping[str, Any]) -> str:
     return f"{name} ({text})" if text or "code" not in control else name
 
 
+def _join_leading(entries: Sequence[str], separator: str) -> str:
+    """Joins as many leading entries as fit into `_MAX_VALUE_LENGTH` characters.
+
+    If entries are left out, "..." stands in their place. The first entry is always there.
+
+    Args:
+        entries: Texts of the entries.
+        separator: Text between two entries.
+    """
+    text = ""
+    for entry in entries:
+        longer = f"{text}{separator}{entry}" if text else entry
+        if text and len(longer) > _MAX_VALUE_LENGTH:
+            return f"{text}{separator}..."
+        text = longer
+    return text
+
+
 def describe_value(value: Any) -> str:
     """Returns a value of a scenario as a short text for the user.
 
-    A list of equal numbers is written as one number.
+    A list of equal numbers is written as one number. Hashes of files are shortened. Of a table
+    or list that is too long, the first entries are written.
 
     Args:
         value: Any value that a scenario may contain.
@@ -719,14 +740,15 @@ def describe_value(value: Any) -> str:
         texts = []
         for key, entry in value.items():
             text = describe_value(entry)
+            if key.endswith("sha256"):
+                text = text[:_HASH_DIGITS]
             texts.append(text if key == "kind" else f"{key} {text}")
-        return " ".join(texts)
+        return _join_leading(texts, " ")
     if isinstance(value, list | tuple):
         entries = [describe_value(entry) for entry in value]
         is_uniform = isinstance(value[0], int | float) and len(set(entries)) == 1
-        text = entries[0] if is_uniform else f"[{', '.join(entries)}]"
-    else:
-        text = f"{value:g}" if isinstance(value, float) else str(value)
+        return entries[0] if is_uniform else f"[{_join_leading(entries, ', ')}]"
+    text = f"{value:g}" if isinstance(value, float) else str(value)
     if len(text) > _MAX_VALUE_LENGTH:
         text = f"{text[: _MAX_VALUE_LENGTH - 3]}..."
     return text

@@ -35,6 +35,24 @@ MOST_METRICS = 10
 """Largest number of metrics in the short text."""
 _ROUNDING_KEYS = ("unaccounted_j",)
 """Keys of metrics that consist of rounding errors."""
+_NEGLIGIBLE = {
+    "": 0.01,
+    "s": 0.1,
+    "1/s": 0.01,
+    "ms": 1.0,
+    "us": 100.0,
+    "rad": 1e-3,
+    "m": 1e-3,
+    "N": 0.1,
+    "N m": 0.1,
+    "N²m²s": 1.0,
+    "J": 0.1,
+}
+"""By unit the magnitude below which a value is negligible for a person who moves an arm.
+
+A force of 0.1 N and a distance of 1 mm can hardly be felt or seen. Without such a scale, the
+change from no torque to 0.06 N m would be as large as that from 0 to 10 N m.
+"""
 _UNDELAYED_KEYS = ("undelayed_max_rad", "undelayed_max_m")
 """Keys of the largest distance from where the peers are at the same time."""
 _SUBJECTS = {
@@ -266,7 +284,9 @@ class LogComparison(Result):
         text = f"in short: {join_words(verdicts)}"
         if not rows:
             return f"{text}; no metric differs"
-        most = max(rows, key=lambda row: _measure_difference(row.values))
+        most = max(rows, key=_measure_difference)
+        if _measure_difference(most) == 0.0:
+            return f"{text}; no metric differs by more than a negligible amount"
         values = [format_number(value, 4) for value in most.values]
         unit = f" {most.quantity.unit}" if most.quantity.unit else ""
         text += f"; the largest difference: {most.quantity.name}, {join_words(values)}{unit}"
@@ -366,19 +386,26 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     )
 
 
-def _measure_difference(values: Sequence[float | None]) -> float:
-    """Returns how far values are apart, as a share of the largest of them.
+def _measure_difference(row: _ComparisonRow) -> float:
+    """Returns how far the values of a metric are apart, relative to their magnitude.
+
+    The negligible magnitude m of the unit is part of the scale:
+
+        (largest value - smallest value) / (m + largest absolute value)
 
     Args:
-        values: Values of one metric. None where it is missing.
+        row: The metric in each run.
 
     Returns:
-        The range divided by the largest absolute value. 0 if fewer than two values are known,
-        or if all of them are zero.
+        The relative difference. 0 if fewer than two values are known, or if all values are
+        negligible.
     """
-    known = [value for value in values if value is not None]
+    known = [value for value in row.values if value is not None]
     largest = max(map(abs, known), default=0.0)
-    return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
+    negligible = _NEGLIGIBLE[row.quantity.unit]
+    if largest < negligible:
+        return 0.0
+    return (max(known) - min(known)) / (negligible + largest)
 
 
 def _select_most_different(
@@ -387,6 +414,7 @@ def _select_most_different(
     """Returns the metrics that differ most between runs, in their order.
 
     Errors of the computation, which are rounding of different size in every run, are left out.
+    Metrics whose values are all negligible come last.
 
     Args:
         rows: The metrics of the runs.
@@ -394,10 +422,10 @@ def _select_most_different(
     """
     differences = {}
     for index, row in enumerate(rows):
-        difference = _measure_difference(row.values)
-        is_notable = difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS
+        known = {value for value in row.values if value is not None}
+        is_notable = len(known) > 1 and row.quantity.key not in _ROUNDING_KEYS
         if is_notable or row.quantity.key in shown_keys:
-            differences[index] = difference
+            differences[index] = _measure_difference(row)
 
     def rank(index: int) -> tuple[bool, float, int]:
         """Returns the place of a row: those of `shown_keys` first, then by difference."""

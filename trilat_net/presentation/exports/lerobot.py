@@ -1,9 +1,10 @@
 """Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
 
 LeRobot trains programs to move robots like people did. A dataset is a sequence of frames at a
-fixed rate, divided into episodes. A frame has the state of the slave arm, the command of every
-user, the dominance factors of the users (the weights with which the slave follows them), and
-in a run with a program whether a person intervened in its place.
+fixed rate, divided into episodes. A frame has the state of the slave arm, the pose of every
+user's arm, the dominance factors of the users (the weights with which the slave follows them),
+the ages of the samples with which the sites follow each other, and in a run with a program
+whether a person intervened in its place.
 
 Invariant:
     - A frame has the newest record of every site at or before its time. A record is the stored
@@ -11,6 +12,9 @@ Invariant:
     - A frame is left out if such a record is older than the period of the site's control loop
       and also older than the period of the frames. Then its episode ends, and the next one
       begins after the gap.
+    - Observations and actions are states of a site at the frame, as its own records have them.
+      The delays of links act on the samples of peers alone. The features `age_s` are the ages
+      of these samples.
     - Numbers are float32. An orientation is six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
@@ -52,12 +56,12 @@ _MEANINGS = {
         "angles, rad, and velocities, rad/s, of the slave's joints; with "
         "observations=reference also the reference that it follows (.ref), in the units of the "
         "actions that sites share; with observations=plugin the observation of "
-        "lerobot_robot_trilat"
+        "lerobot_robot_trilat. All are states of a site at the frame, without delays of links"
     ),
     "observation.environment_state": "the same numbers, for policies that need this name",
     "action": (
-        "command of the leading user; action.USER is the command of each user: angles, rad, or "
-        "a position, m, and an orientation"
+        "where the arm of the leading user is at the frame; action.USER is where the arm of "
+        "each user is: angles, rad, or a position, m, and an orientation"
     ),
     "r11.rot": (
         "an orientation is six entries of the rotation matrix, its first and second column"
@@ -66,6 +70,12 @@ _MEANINGS = {
     "tau_x": (
         "external torque of Eq. (8) at the slave, N m; tau_x.USER is the torque that the hand "
         "of each user feels"
+    ),
+    "age_s": (
+        "age, s, of the sample of each user that the slave follows at the frame, as the delays "
+        "of the links make it; age_s.USER is the age of the sample of the slave that the site "
+        "of each user has in use. Before the first sample, the time since the start of the "
+        "session"
     ),
     "intervention": "true if a user other than the program leads; left out without a program",
     "next.done": "true in the last frame of an episode",
@@ -627,6 +637,7 @@ def _read_columns(
         user_rows = rows[user]
         user_torques = log[user].tau_x[user_rows]
         features.append(_Feature(f"tau_x.{user}", user_torques, joints[user]))
+    features += _read_sample_ages(log, rows, slave, users)
 
     columns: Columns = {}
     names: Names = {}
@@ -635,6 +646,49 @@ def _read_columns(
         names[feature.key] = feature.names
     columns["intervention"] = has_program & (leader != shared.program)
     return columns, names
+
+
+def _read_sample_ages(
+    log: Log, rows: dict[str, Ints], slave: str, users: Sequence[str]
+) -> list[_Feature]:
+    """Returns the ages of the samples with which the slave and its users follow each other.
+
+    The feature `age_s` belongs to the links from the users to the slave, and `age_s.USER` to
+    the link from the slave to a user. Sites without such a link have no such feature.
+
+    Args:
+        log: Log of the run that is exported.
+        rows: For each site, the index of each frame's record, shape (F,).
+        slave: Name of the slave.
+        users: Names of the sites of the users.
+    """
+    features = []
+    sources = [user for user in users if user in log[slave].used]
+    if sources:
+        ages = [_read_ages(log, slave, user)[rows[slave]] for user in sources]
+        features.append(_Feature("age_s", np.stack(ages, axis=1), sources))
+    for user in users:
+        if slave in log[user].used:
+            user_ages = _read_ages(log, user, slave)[rows[user]]
+            features.append(_Feature(f"age_s.{user}", user_ages[:, np.newaxis], [slave]))
+    return features
+
+
+def _read_ages(log: Log, receiver: str, sender: str) -> Array:
+    """Returns the age of the sample in use at each record of the receiver, in s, shape (K,).
+
+    Before the first sample, it is the time since the start of the session, as a program that
+    holds an arm sees it (`PeerView`). It is not NaN, because statistics of NaN are not numbers.
+
+    Args:
+        log: Log of the run that is exported.
+        receiver: Name of the site that receives samples.
+        sender: Name of its peer that sends them.
+    """
+    records = log[receiver]
+    ages_s = records.age_s(sender, log[sender].rate_hz)
+    ages: Array = np.where(np.isnan(ages_s), records.t_ns / NS_PER_S, ages_s)
+    return ages
 
 
 def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:

@@ -1,13 +1,16 @@
 """`trilat compare`: logs side by side, and laws tuned alike."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from tuning_tests.experiments import TRIO
 
+import trilat_net as tn
 from tests.cli.running import trilat
 from tests.json_outline import is_documented
+from trilat_net.analysis.metrics.measures import Metric, quantities
 
 
 @pytest.fixture(scope="module")
@@ -164,3 +167,40 @@ def test_a_shipped_law_is_called_by_its_name(tmp_path: Path) -> None:
     )
     for word in ("somebody", "own law", "law own"):
         assert word not in text
+
+
+def test_the_conclusion_names_a_relevant_difference() -> None:
+    """Rounding errors and a torque that nobody feels are no largest difference."""
+    log = tn.simulate("two_sites", duration_s=0.2)
+    comparison = tn.compare(log, log)
+
+    def conclude(**values_by_key: tuple[float, float]) -> str:
+        """Returns the conclusion for some metrics with these values in the two runs."""
+        rows = tuple(
+            comparison.metrics.row(key)._replace(entries=tuple(map(Metric, values)))
+            for key, values in values_by_key.items()
+        )
+        changed = replace(comparison, metrics=comparison.metrics._replace(rows=rows))
+        texts = [str(block) for block in changed.brief_blocks()]
+        (conclusion,) = (text for text in texts if text.startswith("in short"))
+        return conclusion.partition("; ")[2]
+
+    weak = {"mechanical_j": (1e-16, -2e-9), "peak_tau_nm": (0.0, 0.06)}
+    assert conclude(**weak, rms_error_rad=(0.1, 0.4)).endswith("RMS e, 0.1 and 0.4 rad")
+    assert conclude(**weak) == "no metric differs by more than a negligible amount"
+    assert conclude(hands_j=(0.0, 0.2), peak_tau_nm=(0.0, 9.0)).endswith("0 and 9 N m")
+
+
+def test_metrics_of_every_unit_are_ranked() -> None:
+    """The short text of any two values of any metric has a conclusion."""
+    log = tn.simulate("two_sites", duration_s=0.2)
+    comparison = tn.compare(log, log)
+    assert {"J", "rad", "N m"} < {quantity.unit for quantity in quantities()}
+    for quantity in quantities():
+        row = comparison.metrics.rows[0]._replace(
+            quantity=quantity, entries=(Metric(0.0), Metric(1e6))
+        )
+        changed = replace(comparison, metrics=comparison.metrics._replace(rows=(row,)))
+        text = " ".join(str(block) for block in changed.brief_blocks())
+        is_rounding = quantity.key == "unaccounted_j"
+        assert (f"difference: {quantity.name}" in text) is not is_rounding, quantity.key
