@@ -1,3 +1,4 @@
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,8 @@ import pytest
 import trilat_net
 from tests.scenario.chains import six
 from tests.unit_arm import unit_scenario
+from trilat_net.app.cli.options import list_laws
+from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import (
     compare_scenarios,
@@ -242,7 +245,7 @@ def test_conditions_need_one_ratio_of_error_damping(
     assert all(("one ratio" not in line) == is_known for line in conditions)
 
 
-@pytest.mark.parametrize("law", ["p_d", "pd_d", "lee_spong"])
+@pytest.mark.parametrize("law", ["p_d", "pd_d", "lee_spong", "saturated_pd", "authority"])
 @pytest.mark.parametrize("gravity", [0.8, 1.0])
 def test_conditions_need_exact_gravity(law: str, gravity: float) -> None:
     changes = {"control.law": law, "control.gravity": gravity}
@@ -262,3 +265,11 @@ def test_long_values_end_with_whole_entries() -> None:
     numbers = describe_value([n + 0.125 for n in range(40)]).strip("[]").split(", ")
     assert numbers[:-1] == [f"{n + 0.125:g}" for n in range(len(numbers) - 1)]
     assert numbers[-1] == "..."
+
+
+@pytest.mark.parametrize("scenario", ["p_d_margin_two", "paper", "two_sites"])
+@pytest.mark.parametrize("law", list_laws())
+def test_every_law_is_described_or_refused(law: str, scenario: str) -> None:
+    """A law that does not fit a scenario is refused in a sentence, and never by a failure."""
+    with suppress(ScenarioError):
+        assert describe_scenario(load_scenario(scenario, {"control.law": law}))

@@ -165,7 +165,13 @@ class Authority(ControlLaw):
 
         Args:
             situation: The site, its peers (the other sites) and the delays between them.
+
+        Returns:
+            The condition. None if the law does not compensate gravity exactly, because then no
+            condition is known.
         """
+        if self.gravity != 1.0:
+            return None
         users = []
         for n, law in enumerate(situation.laws):
             if getattr(law, "leads", False):

@@ -112,7 +112,13 @@ class SaturatedPd(ControlLaw):
 
         Args:
             situation: The site, its peers (the other sites), its torque limits and the delays.
+
+        Returns:
+            The condition. None if the law does not compensate gravity exactly, because then no
+            condition is known.
         """
+        if self.gravity != 1.0:
+            return None
         # The condition of P+d, a spring K to the peers and a damper d.
         condition = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:

@@ -48,6 +48,8 @@ class SixChannel(FourChannel):
             a, and with the weights beta with which the torques of the operators add up to zero
             at rest.
         """
+        if len(situation.alpha) != 3:
+            return StabilityCondition(False, "this law is for two users and a slave")
         user_1 = 0
         slave = 2
         a = float(situation.alpha[slave, user_1])  # the slave follows user 1 with the weight a
