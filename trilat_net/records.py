@@ -1,9 +1,9 @@
-"""Describes the records and samples of a tick, which the kernel, the network and the log share.
+"""Defines the record of a control period, and the state that an arm sends to the others.
 
-A site is a process that runs one arm, and a tick is one period of its control loop. The kernel
-computes the record of a tick, the network sends it, and the log stores it. The modules that
-send and store records import these types from here. Therefore they need neither the kernel nor
-its compiler.
+Each arm is controlled by a process called a site, in periods called ticks. The kernel computes
+the record of a tick, the network sends it, and the log stores it. All of them use the types of
+this module. Programs that only send or store records therefore need neither the kernel nor its
+compiler.
 
 Invariant:
     - This module imports nothing of the program.

@@ -1,11 +1,11 @@
-"""Prepares the records of a log for the compiled loop that executes their ticks again.
+"""Converts the records of a log to arrays, so that compiled code can verify them quickly.
 
-A record is the stored result of one tick (period of the control loop) of a site. The compiled
-loop executes the ticks of plain records: consecutive ones whose inputs are all in the log. All
-other records are examined one by one, by `verify`.
+A record is the stored result of one control period (tick) of an arm. To verify a log, each tick
+is computed again. The compiled loop `TickRepeater` does so for many consecutive ticks in one
+call, if all inputs of these ticks are in the log. `verify` executes the other ticks one by one.
 
 Invariant:
-    - Only records in the exact layout that this program writes are prepared.
+    - Only records in the exact layout that this program writes are converted.
 """
 
 from collections.abc import Mapping

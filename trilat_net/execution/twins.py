@@ -1,14 +1,14 @@
-"""Executes twins of a run: repetitions with a small disturbance, side by side with the run.
+"""Shows whether a run is stable, by repeating it with small disturbances.
 
-The difference between a twin and the run shows whether small disturbances grow or decay. The
-disturbance is called a push: a small displacement of the state at one time.
+A repetition is called a twin, and its disturbance a push: a small displacement of the state at
+one time. If the distance between the twin and the run grows, the run is unstable.
 
-A difference that has become large is scaled down again (Benettin, Galgani, Giorgilli and
+A distance that has become large is scaled down again (Benettin, Galgani, Giorgilli and
 Strelcyn, Meccanica 15, 1980). Let x be a number of the twin's state, which includes the samples
-in transit on the network, and x_run the same number in the run. Then x is replaced by
-x_run + factor (x - x_run), with the same factor for all numbers. The total growth of the
-difference accounts for all factors, by the sum of their logarithms. If the difference has
-decayed to rounding errors, the twin is pushed again.
+in transit on the network, and x_run the same number in the run. Then x is replaced by x_run +
+factor (x - x_run), with the same factor for all numbers. The sum of the logarithms of all
+factors gives the total growth. If the distance has decayed to rounding errors, the twin is
+pushed again.
 
 Invariant:
     - The run is executed again from its recorded inputs, and compared with its records.

@@ -1,11 +1,13 @@
-"""Computes how programs move the planar arms of several runs side by side.
+"""Computes how programs move the planar arms of several simulated runs at once.
 
-In each run one program decides at a fixed rate where it pulls the arm of its site, as an
-`OwnHand` does. Here the decisions come from outside, an array for all runs.
+A program may act as the operator of an arm, for example a policy in training. It decides at a
+fixed rate where it pulls the arm. `OwnHand` computes the motion for one run. This module
+computes it for all runs of a training environment in one call, with the decisions of all
+programs as one array, so that no Python code runs for a single run.
 
 Invariant:
-    - The actions are those of `OwnHand.advance_span`, bit for bit, as long as the program
-      decides in time, see `explain_hand`.
+    - The results are those of `OwnHand.advance_span`, bit for bit, if each program decides in
+      time. `SeveralHands.explain` names the programs that this module cannot compute.
 """
 
 import math

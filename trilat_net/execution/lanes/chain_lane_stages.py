@@ -1,10 +1,12 @@
-"""Computes one tick of a site whose arm is a chain of joints, for several runs at once.
+"""Computes one control period of an arm of n joints, for several simulations at once.
 
-The recursions from joint to joint are computed for eight runs at a time, with vectors as
-numbers, see `lane_vectors`. All other stages are loops over the lanes, as in `lane_stages`.
+`lane_stages` does the same for planar arms. The recursions from joint to joint are computed for
+eight runs at a time, with `lane_vectors`. All other stages are loops over the runs, each of
+which has its own lane (position in the vector registers).
 
 Invariant:
-    - No equation of a tick is repeated here. The order of the stages is that of `kernel`.
+    - No equation is repeated here. The functions and the order of the stages are those of
+      `kernel`.
     - The frames of the joints of all lanes are up to date wherever a function of one lane needs
       them. Therefore `place_joints` does nothing in one lane.
 """

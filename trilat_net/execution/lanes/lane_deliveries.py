@@ -1,8 +1,11 @@
-"""Decides for blocks of ticks which sample of each peer a site uses, without the samples.
+"""Computes in advance which received states each arm uses, for a block of control periods.
 
-A sample is the state that a site sends in one tick, a period of its control loop. Its delivery
-depends on the link and on the index of the sample alone. Therefore the deliveries of many ticks
-are computed together, before the ticks.
+In each control period (tick), every arm sends its state, a sample, to the other arms over a
+simulated network. The delay and the loss of a sample depend on the link and on the number of
+the sample, but not on its content. Therefore the deliveries of many ticks can be computed
+before the arms move. Random numbers are then drawn for many samples in one call.
+
+Example: with a delay of 3 ticks, tick 10 uses sample 7, whatever the arms do.
 
 Invariant:
     - The samples in use are those of `accept_sample` and `release_sample`, if all sites have

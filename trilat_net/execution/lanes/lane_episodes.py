@@ -1,7 +1,9 @@
-"""Advances runs of one structure side by side that begin at different times.
+"""Simulates several episodes at once that begin and end at different times.
 
-A run in a lane is replaced by another one when it has ended. Therefore each lane has a clock of
-its own. In each run a program may move the arm of one site; its actions come from outside.
+A training environment with many copies uses this module: when the episode of one copy has
+ended, a new one takes its lane (position in the vector registers), while the others continue.
+Therefore each lane has a clock of its own. In each run, a program may move one arm. The caller
+provides the actions of all programs as an array.
 
 Invariant:
     - After each call of `advance`, a run has the state that `FusedRun.step_to` gives it with

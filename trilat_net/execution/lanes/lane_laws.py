@@ -1,17 +1,17 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return"
-"""Computes the torque of compiled control laws for several runs side by side.
+"""Compiles control laws into the simulation of several runs at once.
 
-A compiled law is a class that is not a part of the kernel, for example `tdpa` or a law of a
-user. The kernel calls the method `torque` by its address. In lanes the method is compiled as a
-part of the tick, with rows in a lane as its input. This saves the call and the checks of the
-lengths of all vectors, which are constants here.
+Laws such as `tdpa`, and those that users write, are classes with a method `torque`. In a single
+run, the simulation calls the compiled method by its address. For several runs, each in one lane
+of the vector registers, the method is compiled as a part of the control period instead. This
+saves the call, and the checks of the lengths of all vectors, which are constants here.
 
 Invariant:
     - The method is not changed. It raises the same errors, and reads and writes the same
       numbers, as in a run of its own.
-    - A law of a user is compiled in each process, because it may use files that are unknown. A
-      law of this package is stored under a hash of its sources.
+    - A user's law is compiled in each process, because the other files that it uses are
+      unknown. The code of a built-in law is stored under a hash of its sources.
 """
 
 import hashlib

@@ -1,13 +1,16 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Defines rows of several runs side by side, which compiled code reads like rows of one run.
+"""Stores the states of several runs side by side, so that loops use vector instructions.
 
-A lane is the position of one run among runs that are computed together. Each number of a row of
-one run becomes `LANES` numbers, which are adjacent in memory. Therefore a loop over the lanes
-can use vector instructions. The functions of the kernel are called with a row in one lane. It
-has the same fields as a row of one run, so that no function of the kernel needs a second form.
+The state of an arm in one run is a row of numbers (`row_fields`). Here each number becomes
+`LANES` numbers that are adjacent in memory, one for each run. For example, the first joint
+angles of all runs follow each other, so one instruction loads several of them. The position of
+a run among the others is called its lane.
 
-Fields that have the same value in all lanes can be constants, for example the control law. The
+The functions of a control period get an object that stands for the row of one lane, with the
+same fields as the row of a single run. No function needs a second version.
+
+Fields that are equal in all lanes, such as the kind of control law, can be constants. The
 compiler then removes the branches for other values.
 
 Invariant:

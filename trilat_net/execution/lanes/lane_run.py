@@ -1,10 +1,13 @@
-"""Advances several runs of one structure together, a lane for each.
+"""Simulates up to `LANES` runs together, each in one lane of the vector registers.
+
+`LaneRun` takes runs with equal structure, for example the points of a sweep over a gain, and
+advances them to a time. It is the counterpart of `FusedRun`, which simulates one run.
 
 Invariant:
     - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
       for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries of
       ring buffers that are not used any more, may differ.
-    - The tables of the lanes do not overlap in memory, as `advance_site` requires.
+    - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
 from collections.abc import Callable, Sequence

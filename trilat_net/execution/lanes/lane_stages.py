@@ -1,11 +1,12 @@
-"""Computes one tick of a site for several runs at once, with the functions of the kernel.
+"""Computes one control period of an arm for several runs at once.
 
-A lane is the position of one run among runs that are computed together. A tick is one period of
-the control loop. Each stage is a loop over the lanes that calls the functions of the kernel.
-The stages are loops of their own, so that each one uses vector instructions.
+Each run has a lane, a position in the vector registers of the processor. Each stage of the
+period, for example the torque of the control law, is a loop over the lanes that calls the
+function of the kernel for one run. The stages have loops of their own, so that the compiler
+turns each loop into vector instructions.
 
 Invariant:
-    - No equation of a tick is repeated here.
+    - No equation of a control period is repeated here.
     - The numbers of a lane do not depend on the other lanes.
 """
 

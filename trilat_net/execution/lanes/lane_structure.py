@@ -1,7 +1,9 @@
-"""Decides which runs can be computed together in lanes, and which need to run alone.
+"""Decides which simulations can be computed together with vector instructions.
 
-Runs can be computed together if they differ in numbers only. Properties that decide which
-equations are evaluated, for example the control law, form the structure of a run.
+Vector instructions evaluate the same equations for several runs. Runs can therefore be computed
+together if they differ in numbers only, such as gains or start poses. Properties that select
+the equations, for example the kind of control law, form the structure of a run. `find_obstacle`
+tells why a run must be computed alone.
 
 Invariant:
     - Two runs with the same structure use the same compiled code and the same number tables.

@@ -1,13 +1,16 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Defines numbers of eight runs as one value, for functions whose loops cannot be turned.
+"""Lets a function that computes one run compute eight runs, by a vector type for its numbers.
 
-The recursions of a chain of joints are loops over the joints. A compiler that may choose the
-loop to use vectors for chooses these, which needs many single reads. Here a value of a function
-of the kernel is a vector with a number of each of eight runs instead. The loops over the joints
-stay as they are, and each operation is one instruction.
+A loop over runs becomes vector instructions if the loop over runs is the innermost one. In the
+dynamics of a chain of joints, the innermost loops go from joint to joint. The compiler would
+vectorise these, although their numbers are not adjacent in memory. Therefore this module
+defines a type of Numba for a value that consists of eight numbers, one for each run. In a
+function that is compiled for this type, `a + b` adds eight pairs of numbers by one instruction.
+The source of the function is not changed.
 
-A function that branches on such a value is refused when it is compiled. It must use `choose`.
+A function that branches on such a value is refused when it is compiled, because the eight runs
+may disagree. It must use `choose` instead.
 
 Invariant:
     - Each number of a result depends on the same numbers, by the same operations, as in a run

@@ -1,4 +1,11 @@
-"""Advances many runs, side by side in lanes where that is possible, and else one by one.
+"""Simulates many runs as fast as possible: together with vector instructions, or one by one.
+
+Parameter sweeps and tuning call `group_runs` with all their runs. Runs with equal structure
+form groups, which are computed in lanes of the vector registers. All other runs are computed
+alone. The caller need not know which runs were computed together:
+
+    for group in group_runs(runs):
+        group.advance_to(10.0)
 
 Invariant:
     - The numbers of a run do not depend on the other runs.

@@ -1,7 +1,9 @@
-"""Advances a run and its twins side by side in lanes.
+"""Simulates a run together with its twins, copies of the run that start slightly displaced.
 
-A twin is a repetition of a run that receives a small push. All of them receive the same samples
-at the same ticks, which are therefore determined only once.
+The distance between a run and its twins shows whether small disturbances grow (`twins`). The
+run and the twins are computed at once, each in one lane of the vector registers. All of them
+receive the same samples (states of the other arms) at the same times, so the deliveries of the
+simulated network are computed once for all.
 
 Invariant:
     - The states and the records are those of `FusedRun`, bit for bit, as long as no arm leaves
