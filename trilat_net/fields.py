@@ -1,9 +1,9 @@
-"""Base class and number types of the tables that a scenario consists of.
+"""Defines the types of the values in a scenario, and the base class of its tables.
 
 A scenario is a TOML file that describes an experiment with several robot arms. Each of its
-tables becomes an object of a subclass of `Frozen`. Annotations such as `Positive` limit the
-range of a number. Annotations such as `Joints` say how many numbers a vector has, for example
-one per joint of the arm. `scenario.key_checks` checks what these types do not state.
+tables becomes an object of a subclass of `Frozen`. Annotations say what a value may be:
+`Positive` limits the range of a number, and `Joints` requires one number per joint of the arm.
+`scenario.key_checks` checks what these types do not state.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it.

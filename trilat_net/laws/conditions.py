@@ -1,12 +1,10 @@
-"""Defines how a control law states its stability condition and its linear form.
+"""Defines how a control law tells when it is stable, and how it behaves for small motions.
 
-The stability condition tells the user for which gains and delays the law is stable. The
-commands `trilat scenario check` and `trilat linear` print it.
-
-The linear form describes the law for small motions around a pose at rest. The linear analysis
-combines the linear forms of all sites (the processes that run one arm each) into one linear
-system with delays. A linear form is a matrix of blocks. Each block says how one quantity, for
-example the torque, depends on another, for example the position.
+- The stability condition says for which gains and delays the law is stable. The commands
+  `trilat scenario check` and `trilat linear` print it.
+- The linear form describes the law near a pose at rest, as a matrix of blocks. Each block says
+  how one quantity, for example the torque, depends on another, for example the position. The
+  linear analysis combines the forms of all arms into one linear system with delays.
 
 Invariant:
     - Each law defines both as methods of its `Settings`, the record of its gains.

@@ -1,17 +1,16 @@
 """Defines the base classes of the built-in control laws, and how a scenario stores their gains.
 
-A control law computes the torque of an arm from the motion of the arm and of its peers. A law
-is written as one class whose annotated attributes are its gains. From this class a second
-class, its `Settings`, is derived: a frozen record of gains that a scenario file contains and
-that is checked when the file is read.
+A law is one class, whose annotated attributes are its gains, for example `Kd`. From this class
+a second class, its `Settings`, is derived. It is the table of gains in a scenario (the file
+that describes an experiment), and is checked when the file is read. An instance of the law
+itself computes the torques of one arm.
 
 Invariant:
-    - A law is one class. The annotations of the class are its gains, with ranges and defaults.
-    - The `Settings` of a law are derived from these annotations. They take over the methods of
-      the class that depend on gains alone, such as the stability condition.
-    - At a site, the process that runs an arm, an instance of the class computes the torques.
-      Laws that the simulation kernel (the compiled code of the control loop) computes have a
-      method `gains` instead of `torque`.
+    - The annotations of the class are its gains, with ranges and defaults.
+    - The `Settings` of a law take over the methods of the class that depend on gains alone,
+      such as the stability condition.
+    - Laws that the compiled control loop computes itself have a method `gains` instead of
+      `torque`.
 """
 
 import ast

@@ -1,12 +1,13 @@
-"""Runs a user's hand program, which acts as the operator of an arm.
+"""Lets a user's program move an arm, as a human operator would.
 
-The program decides at a fixed rate. For each decision it receives a view of what its site, the
-process that runs the arm, knows in a tick (period of the control loop). It returns a target for
-the arm or a force on it.
+The program is a class with a method `act`. At a fixed rate it receives a `HandView`: what the
+control process of the arm knows at that time, such as joint angles and forces. It returns a
+target towards which the arm is pulled, or a force on the arm. A learned policy or a model of a
+human can thus operate a master arm.
 
 Invariant:
-    - A decision that is based on tick k acts a fixed time after tick k, wherever the program
-      runs. A decision that arrives later than this acts at once.
+    - A decision that is based on tick k (a period of the control loop) acts a fixed time after
+      tick k, wherever the program runs. A decision that arrives later than this acts at once.
     - The action is an input of the tick and is stored with it, so a log repeats the action
       without the program.
 """

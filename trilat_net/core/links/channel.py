@@ -1,8 +1,9 @@
-"""Computes when a simulated network delivers each sample, or that it loses the sample.
+"""Computes when a simulated network delivers each message, or that it loses the message.
 
-A link is the directed connection between two sites, the processes that run one arm each. A
-sample is the state that a site sends in one tick (period of its control loop), and its stamp is
-the number of this tick. A link delays each sample, and may lose or duplicate it.
+In each control period, an arm sends its state, a sample, over a link to each other arm. The
+number of the period is called the stamp of the sample. The model of a link may delay, lose or
+duplicate samples, for example with losses in bursts. `schedule_deliveries` computes the fate of
+all samples up to a given one.
 
 Invariant (law L4 of docs/develop/design.md):
 

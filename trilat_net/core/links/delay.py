@@ -1,10 +1,9 @@
-"""Computes by how much a simulated network delays each sample.
+"""Computes the delay of each message in a simulated network.
 
-Two sites, the processes that run one arm each, are connected by a link in each direction. In
-each period of its control loop, a site sends a sample with the state of its arm. The periods
-are numbered, and this number is the index of the sample. The stamp of the sample is the time at
-which it was sent. A delay model is a distribution of delays, a function of time, or a recorded
-trace.
+A delay model is a distribution of delays, a function of time, or a recorded trace. The messages
+are samples: in each control period, an arm sends a sample with its state over a link to each
+other arm. The index of a sample is the number of this period, and its stamp the time at which
+it was sent.
 
 Invariant (law L4 of docs/develop/design.md):
     - A delay depends only on the seed of the link and on the index and the stamp of the sample.

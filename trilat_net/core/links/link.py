@@ -1,15 +1,14 @@
-"""Simulates the delay of a network link, at its receiving end.
+"""Holds each received message until the delay of the simulated network has passed.
 
-A site is a process that runs one arm, and a link is the one-way connection from one site to
-another. In each tick, a period of its control loop, a site sends a sample, which is the state
-of its arm. The sample carries the number of the tick, which is called its stamp. The receiver
-keeps each sample until its simulated delivery time, which is called the due time.
+In each control period (tick), an arm sends a sample, its state, to each other arm. A real
+network may be faster than the network that an experiment emulates. Therefore the receiver keeps
+a sample until its due time: the time at which it was sent, plus the simulated delay.
 
-Samples wait in a ring buffer, which is called the calendar of the link. It has a page for each
-of the next ticks of the receiver. `accept_sample` writes a sample into the page of the tick
-that will use it, unless this page holds a newer sample. `release_sample` reads the page of the
-present tick. Both take the same time for any delay. Due times are kept longer than samples, for
-as long as a late sample or a duplicate may arrive.
+The samples wait in a ring buffer with one page for each of the next ticks of the receiver,
+called the calendar. `accept_sample` writes a sample into the page of the tick that will use it,
+unless this page holds a newer sample. `release_sample` reads the page of the present tick. Both
+take the same time for any delay. Due times are kept longer than samples, for as long as a late
+sample or a duplicate may arrive.
 
 Invariant (law L2 of docs/develop/design.md):
     - The due time of a sample is an integer in ns. It follows from the time at which the sample

@@ -1,10 +1,10 @@
-"""Describes the numbers that a control law sends to other arms besides the motion.
+"""Defines where the numbers that a control law sends to other arms are stored in a record.
 
-A site is a process that runs one arm, and its peers are the other sites. Some control laws send
-vectors of numbers to their peers, for example wave variables or energies. A vector either goes
-to all peers, or each peer gets a vector of its own.
+Each arm sends its motion to the other arms, its peers. Some control laws send further vectors,
+for example wave variables or energies. A vector either goes to all peers, or each peer gets a
+vector of its own.
 
-In each tick, a period of the control loop, the site stores all numbers that its law sends in
+In each control period, the site (the process that controls an arm) stores all these numbers in
 the field `ch` of its record. A peer receives the part that is meant for it. Therefore the
 records of the sender show what each peer received.
 

@@ -1,13 +1,14 @@
-"""Calls a user's control law in plain Python: its input, its results and its memory.
+"""Calls a user's control law in plain Python, once per period of the control loop.
 
-A control law is a class with a method `torque`, which computes the torque of an arm in each
-tick (period) of the control loop. Between ticks a law may keep numbers, its memory.
+A control law is a class with a method `torque`, which computes the torque of an arm from a
+`LawInput`: the motion of the arm and of the other arms. From period to period a law may keep
+numbers, its memory, for example an integral of the error.
 
 Invariant:
     - A law is a function of its input and its memory: equal inputs and an equal memory give
       equal torques.
-    - The record of each tick, its stored result, contains the memory. A run can therefore be
-      resumed from the middle of its log.
+    - The record of each period contains the memory. A run can therefore be resumed from the
+      middle of its log.
 """
 
 import math

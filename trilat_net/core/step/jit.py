@@ -1,20 +1,16 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
 """Compiles numerical functions with Numba, and stores their machine code on disk.
 
-The decorator `leaf` marks a function of numbers and arrays that is to be compiled. A marked
-function is called a leaf.
+A function with the decorator `leaf` is compiled at its first call. Compiling the whole core
+takes long, so later processes load the stored code. Numba has such a cache too, but it does not
+notice a change of a function that the stored function calls.
 
-Where the code is stored:
-    - The machine code is in the user's cache directory, in a folder named after a hash of all
-      source files of this package and of `records.py`, whose constants it contains. Numba alone
-      notices a change of the file that holds a function, but not of the functions that it
-      calls.
-    - A binary wheel contains the same kind of folder, with code for any processor of its
-      platform. This code is used if the cache directory has no code for the present processor.
-
-A leaf that is called from Python is stored as machine code. A leaf that is called by another
-leaf is called an inner leaf. It is stored as LLVM code before optimisation, because it is
-optimised together with its caller.
+- The code is stored in the user's cache directory, in a folder named after a hash of all source
+  files of this package and of `records.py`, whose constants it contains.
+- A binary wheel contains the same kind of folder, with code for any processor of its platform.
+  This code is used if the cache directory has no code for the present processor.
+- A function that is called by another compiled function only, an inner leaf, is stored as LLVM
+  code before optimisation, because it is optimised together with its caller.
 
 Invariant:
     - Floating-point operations are not reordered (no fastmath). Therefore compiled functions

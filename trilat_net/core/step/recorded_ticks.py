@@ -1,13 +1,15 @@
-"""Executes recorded ticks of a site again in one compiled loop, and compares their results.
+"""Verifies many recorded control periods of an arm in one compiled loop.
 
-A tick is one period of the control loop of a site, the process that runs one arm. Its record
-contains its inputs, such as the samples (states of other sites) that arrived, and its results.
+A log has a record of each control period (tick), with its inputs, such as the received states
+of the other arms, and its results. The loop computes the ticks again from their inputs and
+compares the results. It does the same as repeated calls of `Site.step`, but faster.
 
 Invariant:
     - The loop calls the stages of the kernel, as `Site.step` does. It contains no equation.
     - A row of the record counts as repeated only if every computed number has the same bits.
     - The loop ends before the first tick that it cannot execute or does not repeat. The site
-      is then in the state before this tick, and `Site.step` can execute it.
+      (the state of the arm and its controller) is then in the state before this tick, and
+      `Site.step` can execute it.
 """
 
 import zlib
