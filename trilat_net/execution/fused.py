@@ -1,9 +1,9 @@
-"""Simulates all arms of a scenario in one compiled loop, without writing a log.
+"""Simulates an experiment about 1000 times faster than real time, without writing a log.
 
-A scenario describes an experiment with several sites, processes that each run one arm. The
-simulation is about 1000 times faster than real time. It does not store every tick (period of
-the control loop). It stores the largest values of every interval of 50 ms, and sums over the
-run. It is used for parameter studies, and to repeat runs with a small disturbance.
+All arms of the experiment are simulated in one compiled loop. It does not store every tick
+(period of the control loop), but the largest values of every interval of 50 ms, and sums over
+the run. Parameter sweeps use this module, and so does the repetition of runs with a small
+disturbance, which shows whether they are stable.
 
 Invariant:
     - The results equal the results of `execution.virtual` with its default network, bit for

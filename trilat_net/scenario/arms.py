@@ -1,9 +1,10 @@
 """Defines the arms of an experiment: the planar two-link arm, and chains from URDF files.
 
-`Arm` and `Task` are parts of a scenario, the description of an experiment. `build_arm` converts
-them to an `ArmModel` with the geometry and the dynamic parameters that computations need. From
-the model, `compute_rest_gains` derives the damping with which an arm is brought to rest.
-`bound_estimates` derives bounds for the parameters that an adaptive control law estimates.
+`Arm` and `Task` are the tables in which the author of an experiment describes an arm.
+`build_arm` converts them to an `ArmModel` with the geometry and the dynamic parameters that
+computations need. From the model, `compute_rest_gains` derives the damping with which an arm is
+brought to rest, and `bound_estimates` the bounds for the parameters that an adaptive control
+law estimates.
 
 Invariant:
     - If one arm of a scenario is a chain, all arms are modelled as chains. The planar arm is

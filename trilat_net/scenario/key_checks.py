@@ -1,8 +1,8 @@
-"""Checks of the values of a scenario's keys, and of the lengths of its vectors.
+"""Checks the keys of a scenario that the types of its tables cannot check.
 
-A scenario is a TOML file that describes an experiment with several robot arms. `fields` has the
-types of its tables. The functions of this module check what these types do not state, for
-example how many numbers a vector needs for the arm of its site.
+A scenario is a TOML file that describes an experiment with several robot arms. The types of its
+tables (`fields`) limit single numbers. The functions of this module check the rest, for example
+that a vector has one number per joint of its arm, and that a key has a known name.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it. For an unknown

@@ -1,8 +1,8 @@
-"""Applies overrides KEY=VALUE, which change single keys of a scenario.
+"""Changes single keys of a scenario by overrides such as `control.Kd=5`.
 
-A scenario is a TOML file that describes an experiment: its sites, the processes that run one
-arm each, and the network links between them. Overrides change the tables of such a file, or a
-resolved scenario, in which every key of every site and link is written out.
+A scenario is a TOML file that describes an experiment. Overrides change the tables of such a
+file, or a resolved scenario, in which every key of every site (the control process of an arm)
+and of every network link is written out.
 
 Invariant:
     - In a resolved scenario, a key without the name of a site or link (`control.Kd`,

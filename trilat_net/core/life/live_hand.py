@@ -1,8 +1,9 @@
-"""Computes how a person or program pulls an arm, from its messages during a run.
+"""Computes how a human or a program pulls an arm, from messages that arrive during a run.
 
-A person or program that moves an arm during the run is called a live hand. Its messages contain
-goals. A target moves towards the newest goal, and a simulated spring pulls the arm to the
-target. The force of the spring is multiplied by the grip, a number from 0 to 1.
+A person who drags an arm on a web page, or a program with a haptic device, sends messages with
+goals. Such an operator is called a live hand. A target moves towards the newest goal, and a
+simulated spring pulls the arm to the target. The force of the spring is multiplied by the grip,
+a number from 0 to 1.
 
 Rules:
 
