@@ -36,15 +36,15 @@ K = TypeVar("K", bound=Frozen)
 
 
 def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the subclasses of a base class that the files of a package define.
+    """Yields the classes that a scenario can select by name, as in `kind = "wall"`.
 
-    Each subclass is a kind that a scenario can select by the tag of the class, as in
-    `kind = "wall"`. Classes without a tag are only bases of others, and are left out. The order
-    is that of the files, and of the positions in each file.
+    To add a kind, add a file to the package; there is no other list. Classes without a tag
+    (name) of their own are only bases of others, and are left out. The order is that of the
+    files, and of the positions in each file.
 
     Args:
         package: Dotted name of the package whose files are searched.
-        base: The base class, for example that of all control laws.
+        base: Base class of the kinds, for example that of all control laws.
     """
     folders = import_module(package).__path__
     for file in pkgutil.iter_modules(folders):

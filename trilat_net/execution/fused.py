@@ -62,7 +62,9 @@ from ..scenario import PlantPlayer, Scenario, Wall, make_hand_players, refuse_ex
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Returns, for each eight bytes of a data type, whether they are a floating-point number.
+    """Marks which numbers of a row are floats and which are integers, each of eight bytes.
+
+    Only floats can be scaled (`scale_differences`).
 
     The fields of all data types of the kernel are multiples of eight bytes.
     """
@@ -257,7 +259,7 @@ def _make_prompt_inputs(sites: int) -> RunInputs:
 
 
 class RunMemory(NamedTuple):
-    """All arrays of a run, for drivers that compute several runs together.
+    """All arrays of a run, for modules that compute several runs together.
 
     N is the number of sites.
 
@@ -290,7 +292,7 @@ class RunMemory(NamedTuple):
 
 
 class FusedRun:
-    """Run of all sites of a scenario in one compiled loop.
+    """Simulation of all arms of a scenario in one compiled loop.
 
     A site is a process that runs one arm and its control loop. Control laws that can be
     compiled are executed within the loop. Laws in plain Python are called between the stages of
@@ -466,7 +468,7 @@ class FusedRun:
 
     @property
     def memory(self) -> RunMemory:
-        """All arrays of the run. They change while it is executed."""
+        """All arrays of the run, as views that change while the run advances."""
         return RunMemory(
             tables=self._tables,
             progress=self._progress,

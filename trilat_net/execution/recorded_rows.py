@@ -29,7 +29,7 @@ _MASK_64 = (1 << 64) - 1
 
 
 class SampleTable(NamedTuple):
-    """Samples (states that the sites sent) of all sites of a log.
+    """The states (samples) that all sites of a log sent, for a fast look-up by site and tick.
 
     Attributes:
         bits: Position, velocity and external torque of each sample in the coordinates that
@@ -45,7 +45,7 @@ class SampleTable(NamedTuple):
 
 
 def make_sample_table(log: Log) -> SampleTable | None:
-    """Collects the samples of all sites of a log.
+    """Collects the states (samples) that all sites of a log sent, for the compiled loop.
 
     Args:
         log: The log.

@@ -48,7 +48,9 @@ WINDOWS = 16
 
 
 class Push(NamedTuple):
-    """Small displacement of the state of a twin, which is a second execution of the same run.
+    """Small displacement of the state of a twin, for example by 1e-6 rad at one joint.
+
+    A twin is a second execution of the same run.
 
     The difference between the twin and the run then shows whether small disturbances grow or
     die away.
@@ -177,7 +179,7 @@ class Push(NamedTuple):
 
 
 class TwinPath(NamedTuple):
-    """Course of the difference between a twin and the run, in intervals of 50 ms.
+    """Distance between a twin and the run over time, in intervals of 50 ms.
 
     A twin is a second execution of the run in which the state received a small push. If the
     difference becomes large, it is scaled down, and if it has decayed, the twin is pushed
@@ -208,7 +210,7 @@ class TwinPath(NamedTuple):
 
 
 class Twins(NamedTuple):
-    """A run, compared with its twins.
+    """A run and slightly displaced copies of it, which show whether the run is stable.
 
     A twin is a second execution of the run in which the state received a small push. The twins
     show whether small disturbances grow or die away. `of_log` and `of_scenario` create the

@@ -41,7 +41,7 @@ class ArmLoad(NamedTuple):
 
 
 class LawSituation(NamedTuple):
-    """Facts about a session on which the stability condition of one site's law may depend.
+    """Input of a stability condition: the laws, delays and weights of all sites of a session.
 
     Attributes:
         site: Index of the site.
@@ -340,7 +340,7 @@ and "tau_h" for the torque ON the arm.
 
 
 class LinearSituation(NamedTuple):
-    """Facts about a session on which the linear form of one site's law may depend.
+    """Input of a linear form: the laws and weights of all sites, and the inertia of the arm.
 
     Attributes:
         site: Index of the site.
@@ -364,7 +364,7 @@ class LinearSituation(NamedTuple):
 
 
 class LinearForm:
-    """Control law, linearised for small motions of a site, as a matrix of blocks.
+    """Behaviour of a control law for small motions of its arm, as a matrix of blocks.
 
     For a site with n joints, each block is a matrix of n x n numbers. It says how a quantity
     (the row) depends on another (the column): for example the block ("tau", "q") is the

@@ -112,7 +112,7 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def plugged(self) -> bool:
-        """True if the class of the law computes the torque.
+        """True if the class of the law computes the torque itself, by a method `torque`.
 
         Otherwise the simulation kernel, the compiled code of the control loop, contains the
         law.
@@ -121,7 +121,7 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def books_energy(self) -> bool:
-        """True if the law balances the energies that the sites exchange.
+        """True if the law keeps an account of the energy that the arms exchange.
 
         Then all sites must use this law: each site adds up the energy that it sends, and the
         receiving site subtracts what it uses.
@@ -224,7 +224,7 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law acts like passive springs between the positions of the arms.
+        """Returns True if the law couples the arms like passive springs and dampers.
 
         This requires that the law compensates gravity exactly. Stability conditions of laws of
         this kind need reversible dominance factors. The dominance factor alpha_ij is the weight
@@ -234,7 +234,7 @@ class LawSettings(Frozen, frozen=True):
         return False
 
     def target_motion(self, run: TuningRun) -> Array | None:  # noqa: ARG002
-        """Computes the motion that the law promises for the arms, as the goal of its tuning.
+        """Computes how the arms should move with good gains, as the goal of the tuning.
 
         Gains are tuned for arms that move together and rest at the pose to which the operators
         pull them. A law that promises another motion defines this method. Its gains are then
@@ -415,7 +415,7 @@ class ControlLaw:
 
 
 class EnergyLaw(ControlLaw):
-    """Base class of the laws that balance energy between the sites, the processes of the arms.
+    """Base class of the laws that keep an account of the energy that the arms exchange.
 
     One site counts the energy that it sends, and the other site counts the energy that it uses.
     Therefore all sites must use the same law. These laws require the integration scheme

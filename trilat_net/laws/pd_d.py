@@ -80,11 +80,11 @@ class PdD(ControlLaw):
         )
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law compensates gravity exactly.
+        """Returns True if the law couples the arms like passive springs and dampers.
 
-        The law then acts like springs and dampers between the positions of the arms. Stability
-        conditions of laws of this kind need reversible dominance factors. The dominance factor
-        alpha_ij is the weight with which site i follows site j. The factors are reversible if
-        positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+        This requires `gravity` = 1, so that the law compensates the gravity torque exactly.
+        Stability conditions of laws of this kind need reversible dominance factors, the weights
+        alpha_ij with which site i follows site j: positive weights D_i must exist with D_i
+        alpha_ij = D_j alpha_ji.
         """
         return self.gravity == 1.0

@@ -26,7 +26,7 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """How many numbers the vectors of a site have, which depends on its arm.
+    """Lengths of the vectors of a site in a scenario, for example 6 gains for 6 joints.
 
     A scenario may state one number where a vector is needed. The counts say how long the vector
     becomes, and check vectors that are given in full.
@@ -91,7 +91,11 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 @lru_cache(maxsize=256)
 def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """Returns the fields of a table's type. msgspec itself evaluates its types in each call."""
+    """Returns the fields of the type of a scenario's table, for example of `Arm`.
+
+    The result is cached, because `msgspec.structs.fields` evaluates the annotations of the type
+    anew in each call, and a scenario has many tables of the same type.
+    """
     return msgspec.structs.fields(kind)
 
 

@@ -132,7 +132,7 @@ class HandRules(NamedTuple):
 
 
 class HandCommand(NamedTuple):
-    """Message by which a person or program moves an arm during the run.
+    """Message by which a human or program moves an arm during the run.
 
     Attributes:
         source: Identifies the sender, a random number above 0.
@@ -152,7 +152,7 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """State of a live hand, a person or program that moves an arm, between two control periods.
+    """State of a human or program that moves an arm, as stored between two control periods.
 
     Attributes:
         source: Sender that holds the arm; 0: nobody, though a grip may still fade.
@@ -181,7 +181,7 @@ class HandMemory(NamedTuple):
 
 
 class HandInForce(NamedTuple):
-    """What a live hand, a person or program that moves an arm, does in one tick.
+    """How a human or program pulls an arm in one control period, as a record contains it.
 
     A tick is a control period. The fields are in the order of the field `hand` of its record.
 
@@ -219,7 +219,7 @@ class HandInForce(NamedTuple):
 
 
 class HandStep(NamedTuple):
-    """What a person or program does with an arm in one control period.
+    """Result of one control period for the human or program that moves an arm.
 
     Attributes:
         memory: State for the next period.

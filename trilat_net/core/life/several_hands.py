@@ -27,7 +27,9 @@ ACTION_NUMBERS = 1 + 2 * AXES
 
 
 class HandArrays(NamedTuple):
-    """State and limits of the programs' hands in L runs, see `HandMemory` and `HandRules`.
+    """How programs pull the arms in L runs: the state and the limits of each pull.
+
+    See `HandMemory` and `HandRules` for the same quantities of a single run.
 
     Attributes:
         holds: 1 if the program holds the arm, shape (L,).
@@ -170,7 +172,7 @@ def _advance_hands(
 
 
 class SeveralHands:
-    """Hands of programs in several runs, one in each.
+    """Computes how programs pull the arms in several runs, one program in each run.
 
     Args:
         count: Number L of runs.
@@ -219,7 +221,7 @@ class SeveralHands:
 
     @staticmethod
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Explains why the hand of a program cannot be computed here.
+        """Returns why the actions of a program cannot be computed for several runs at once.
 
         Args:
             rules: Its limits.
@@ -238,7 +240,7 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Lets the hand of a run begin: it does not hold the arm.
+        """Prepares a new run, in which the program does not hold the arm yet.
 
         Args:
             run: Index of the run.
@@ -270,7 +272,7 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes the actions of a span of ticks, which a decision may begin.
+        """Computes how each program pulls its arm in the next ticks, from its decisions.
 
         Args:
             runs: Number of runs that are advanced, the first ones.

@@ -61,13 +61,13 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
 @leaf
 def loses_samples(model: Row) -> bool:
-    """Returns True if a model may lose samples at random, so that its losses are drawn."""
+    """Returns True if a network model may lose samples at random."""
     return bool(model.loss_good != 0.0 or model.enter != 0.0)
 
 
 @leaf
 def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Advances the chain of losses by one sample, and returns True if the sample is lost.
+    """Decides by random numbers whether the next sample is lost, with losses in bursts.
 
     The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
     loss. A fresh chain starts in its stationary distribution, where the bad state has the

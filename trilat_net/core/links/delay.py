@@ -62,7 +62,7 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """What a trace, a table of delays by time, does after its last point.
+    """How a trace, a table of delays by time, continues after its last point.
 
     It holds the last delay, or starts again.
     """
@@ -72,7 +72,7 @@ class TraceEnd(IntEnum):
 
 
 class LinkModel(NamedTuple):
-    """Effect of a link on its samples, from a stamp on until the next model applies.
+    """Network model of a link, its delay and its losses, for samples sent from a time on.
 
     The stamp of a sample is the time at which it was sent.
 

@@ -26,7 +26,7 @@ MAX_RECORD_SENT = 1024
 
 
 class SentVector(NamedTuple):
-    """Vector that a law sends at every tick.
+    """Vector that a control law sends to other arms at every tick, for example energies.
 
     Attributes:
         name: Name of the vector, as the law uses it.
@@ -177,7 +177,7 @@ class LawChannel(NamedTuple):
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns all vectors that a law may receive from its peers, each name once.
+    """Returns all vectors that a law may receive from the other arms; equal names appear once.
 
     Args:
         channels: Vectors that the laws of the peers send.

@@ -41,7 +41,7 @@ class PeerRecords(NamedTuple):
 
 
 class LawRecords(NamedTuple):
-    """Records of the site of a law: K ticks, one row per tick.
+    """Recorded motion, torques and messages of a site in K ticks, for energy accounts.
 
     Attributes:
         h_s: The period, s.
@@ -65,7 +65,9 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Energies of a law in K ticks, J, shape (K,) or (K, parts) each.
+    """Account of the energy that a control law gave, took, stored and dissipated in K ticks.
+
+    All energies are in J and have the shape (K,) or (K, parts).
 
     Flows are sums since the beginning. Each part, for instance that of a joint, must not be
     below zero by itself.

@@ -92,7 +92,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """List of numbers with arithmetic, in which a law in plain Python receives its vectors.
+    """List of numbers with arithmetic, so that users can write control laws as formulas.
 
     Operations act number by number, as in `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`. The
     other operand is a number, or a list with as many numbers.
@@ -109,7 +109,10 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """Peer as a law sees it in a tick: its sample in use, or its start pose at rest.
+    """What a control law knows about another arm (a peer) in a tick.
+
+    This is the newest sample of the peer that the law may use, or the peer's start pose at rest
+    before the first sample.
 
     A sample is the state that a peer published in one of its ticks.
 

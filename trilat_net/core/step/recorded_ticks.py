@@ -103,7 +103,10 @@ class RecordedRows(NamedTuple):
 
 
 class SiteViews(NamedTuple):
-    """Memory of a site in forms that the compiled loop compares and writes.
+    """State of a site as integers, so that the compiled loop can compare all bits.
+
+    Two floating-point numbers can be equal although their bits differ, such as 0.0 and -0.0,
+    and NaN is not equal to itself. A word is the bits of a number as an integer.
 
     Attributes:
         site: Row of the site, as integers.
@@ -127,7 +130,7 @@ class SiteViews(NamedTuple):
 
 
 class TickRules(NamedTuple):
-    """Properties of a site that do not change during its run.
+    """Properties of a site that stay the same during its run, for the compiled loop.
 
     Attributes:
         rate_hz: Tick rate, Hz.

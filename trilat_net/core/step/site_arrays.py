@@ -405,7 +405,10 @@ class CalendarSizer:
         self.newest[peer] = -1
 
     def list_rooms(self) -> list[tuple[int, int]]:
-        """Returns the facts by which `recorded_ticks` checks whether samples fit.
+        """Returns how long samples of each peer may wait in the calendar.
+
+        The compiled loop of `recorded_ticks` needs these numbers to check whether a sample fits
+        into the ring buffer.
 
         Returns:
             For each peer its entry of `newest`, and how many ticks a sample waits at most.

@@ -68,7 +68,7 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class TickParts(NamedTuple):
-    """Parts of a site that execute its ticks.
+    """Parts of a `Site` that `recorded_ticks` needs to execute many of its ticks at once.
 
     Attributes:
         buffers: Input and output of a tick.
@@ -92,7 +92,7 @@ class TickParts(NamedTuple):
 
 
 class Site:
-    """Manipulator with its controller and the receiving ends of its links.
+    """State of one arm with its controller and with the network links over which it receives.
 
     The process of a site creates this object and calls `step` once per tick. The simulation
     in virtual time does the same for each site.

@@ -47,7 +47,9 @@ NO_LAW = "none"
 
 
 class LaneLaw(NamedTuple):
-    """A compiled law of one site in a run, as far as it decides about the compiled code.
+    """Properties of a site's compiled control law on which the code of its tick depends.
+
+    Runs for which these properties are equal share the code.
 
     Attributes:
         name: Name of the law, from all that its code depends on. `NO_LAW` without such a law.
@@ -91,7 +93,7 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
 
 
 def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
-    """Returns what decides about the compiled code of a site's law.
+    """Returns the properties of a site's law on which the compiled code of its tick depends.
 
     Args:
         law: The law; None if the law of the site is a part of the kernel.
@@ -118,7 +120,9 @@ def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
 
 
 class LawCode(types.Type):
-    """Numba's type of a value that stands for the code of a law.
+    """Numba's type of an argument that tells the compiler which control law to call.
+
+    The argument has no value at run time: its type alone selects the code.
 
     Args:
         law: The law.
@@ -206,7 +210,7 @@ def compute_law(
     received: RowArray,
     sent: RowArray,
 ) -> None:
-    """Computes the torque of a compiled law in one lane, see `law_stage`.
+    """Computes the torque of a compiled control law for one of the runs, see `law_stage`.
 
     Nothing happens if the law of the site is a part of the kernel.
 

@@ -55,7 +55,7 @@ Constants = tuple[tuple[str, int], ...]
 
 
 class LaneField(NamedTuple):
-    """A field of a row in lanes.
+    """One field of a row, with its position among the numbers of the row.
 
     Attributes:
         name: Name of the field.
@@ -71,7 +71,9 @@ class LaneField(NamedTuple):
 
 
 class LaneTable(types.Type):
-    """Numba's type of a table of rows in all lanes, a pointer to its first number.
+    """Numba's type of an array that holds the rows of all lanes, such as the states of an arm.
+
+    A value of this type is a pointer to the first number of the array.
 
     Args:
         dtype: Data type of a row of one run. All its numbers have 64 bits.
@@ -99,7 +101,7 @@ class LaneTable(types.Type):
 
     @property
     def count(self) -> int:
-        """Number of rows with constants of their own."""
+        """Number of rows that have fields of their own that are equal in all lanes."""
         return len(self.constants)
 
 
@@ -114,23 +116,26 @@ class _PartOfTable(LaneTable):
 
 
 class RowsInLane(_PartOfTable):
-    """Type of all rows of a table in one lane."""
+    """Numba's type of all rows that belong to one lane, for example of all links of an arm."""
 
 
 class LaneRow(_PartOfTable):
-    """Type of one row of a table in one lane."""
+    """Numba's type of one row in one lane, which functions use like the row of a single run."""
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the field of a name, or None."""
+        """Returns the field with this name, or None if the row has none."""
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is equal in all lanes, or None."""
+        """Returns the value of a field if it is the same in all lanes, else None."""
         return dict(self.constants[0]).get(name)
 
 
 class LaneNumbers(types.Type):
-    """Numba's type of one integer per lane, a pointer to the first one."""
+    """Numba's type of an array with one integer per lane, such as the present tick.
+
+    A value of this type is a pointer to the first integer.
+    """
 
     in_lanes = True
 
@@ -168,7 +173,9 @@ def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
 
 
 def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
-    """Generates the address of rows that begin so many numbers behind a pointer to rows.
+    """Generates LLVM code for the address of rows that begin `words` numbers behind a pointer.
+
+    Each number of a row occupies `LANES` numbers in memory.
 
     Args:
         builder: Appends LLVM instructions.
@@ -393,7 +400,10 @@ pointer_to: Any = _pointer_to
 
 
 def allocate_words(rows: int, row_length: int) -> Words:
-    """Returns zeros that begin at a cache line, shape (rows, words, LANES).
+    """Returns an array of zeros for the rows of all lanes, aligned to a cache line.
+
+    The shape is (rows, numbers of a row, LANES). Vector instructions read an aligned array
+    faster.
 
     Args:
         rows: Number of rows.
@@ -406,7 +416,9 @@ def allocate_words(rows: int, row_length: int) -> Words:
 
 
 def read_words(rows: NDArray[Any]) -> Words:
-    """Returns rows of one run as words, shape (rows, words of a row).
+    """Returns the numbers of structured rows as integers with the same bits ("words").
+
+    The shape is (rows, numbers of a row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

@@ -57,7 +57,7 @@ _STATE_FIELDS = ("q", "qd", "tau_x")
 
 
 class SiteTables(NamedTuple):
-    """The tables of one site in all lanes, in the order of the arguments of `advance_site`.
+    """Arrays with the state of one site in all lanes, as `advance_site` takes them.
 
     Attributes:
         site: Row of the site.
@@ -95,7 +95,7 @@ class SiteTables(NamedTuple):
 
 
 class LaneLayout(NamedTuple):
-    """Layouts of the tables of a run.
+    """Data types and lengths of the arrays of a run, on which its code depends.
 
     Attributes:
         site: Of the row of a site.
@@ -129,7 +129,7 @@ class LaneLayout(NamedTuple):
 
 
 def find_layout(run: FusedRun) -> LaneLayout:
-    """Returns the layouts of the tables of a run."""
+    """Returns the data types and lengths of all arrays of a run, on which its code depends."""
     memory = run.memory
     tables = memory.tables
     return LaneLayout(
@@ -155,7 +155,7 @@ def list_argument_types(
     site: SiteStructure,
     clock: types.Type = types.int64,
 ) -> tuple[Any, ...]:
-    """Returns Numba's types of the arguments of `advance_site` for a site.
+    """Returns Numba's types of the arguments with which the tick of a site is compiled.
 
     Args:
         layout: Layouts of the tables.
@@ -209,7 +209,7 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
 
 
 def choose_code(layout: LaneLayout) -> Callable[..., None]:
-    """Returns the function that computes a tick of a site in lanes."""
+    """Returns the function that computes a tick in lanes, for planar arms or for chains."""
     return advance_site if layout.chain is None else advance_chain_site
 
 
@@ -233,7 +233,10 @@ def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -
 
 
 def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
-    """Explains why the laws of a run cannot be compiled in lanes, although they can be alone.
+    """Returns why a control law cannot be compiled for several runs at once, for a message.
+
+    Such a law may still be compiled for a single run. To find out, this function compiles the
+    code.
 
     The code is compiled for this answer.
 
@@ -252,7 +255,7 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
-    """Returns the machine code of the ticks of a site in lanes as text, for tests.
+    """Returns the machine code of the ticks of a site as text, in which tests look for vectors.
 
     Args:
         run: The run.
@@ -284,7 +287,9 @@ def _copy_records(first: int, kept: Array, records: Array) -> None:
 
 
 def has_lane_code(run: FusedRun) -> bool:
-    """Returns True if the code for a run in lanes exists already.
+    """Returns True if the code for these runs has been compiled and stored before.
+
+    The runs can then start at once.
 
     Args:
         run: The run. There must be no obstacle, see `find_obstacle`.
@@ -348,7 +353,7 @@ class _LinksOfRun:
 
 
 class LaneRun:
-    """Several runs of one structure that advance together, each in a lane of its own.
+    """Simulates several runs of equal structure together with vector instructions.
 
     Args:
         runs: The runs before their first tick, at most `LANES`. They must have the same
@@ -610,7 +615,7 @@ class LaneRun:
             self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Removes all runs but some from the lanes, so that only these advance further.
+        """Continues with some of the runs only, so that no time is spent on the others.
 
         Args:
             chosen: Indices of the runs to keep in `runs`, in rising order. None of them may
@@ -715,7 +720,7 @@ class LaneRun:
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
-    """Returns a table of shape (N, rows, columns) as N words rows."""
+    """Returns an array of shape (N, rows, columns) as N structured rows, without copying it."""
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
 
@@ -734,7 +739,12 @@ def _check_distinct(tables: SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured rows by their words, shape (rows, words of a row)."""
+    """Overwrites structured rows by numbers given as integers with the same bits ("words").
+
+    Args:
+        rows: The rows; written.
+        numbers: The numbers, shape (rows, numbers of a row).
+    """
     new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
     rows[...] = new_rows.reshape(rows.shape)
 

@@ -402,7 +402,7 @@ def advance_site(
 
 
 class EndedRuns(NamedTuple):
-    """The numbers of runs at the instant at which an arm of theirs left its limits.
+    """States of runs that have ended, at the time at which one of their arms left its limits.
 
     A run that has ended stays in its lane, and its later numbers have no meaning. N is the
     number of sites, and the last axis of each array is the lane.
@@ -434,7 +434,7 @@ class EndedRuns(NamedTuple):
 
 @leaf
 def copy_lane(lane: int, source: Words, target: Words) -> None:
-    """Copies the numbers of one lane.
+    """Copies all numbers of one run (lane) from one array to another.
 
     Args:
         lane: The lane.
@@ -457,7 +457,9 @@ def keep_ended_runs(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Keeps the numbers of runs of which an arm left its limits in the present tick.
+    """Stores the final state of each run in which an arm left its limits in this tick.
+
+    The other runs continue, so the numbers in the lane of an ended run are overwritten later.
 
     Args:
         ticks: Number of ticks that the runs have made, of all runs or of each run.
@@ -514,7 +516,7 @@ def run_block(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Steps all sites of several runs, up to the end of a block or until all runs have ended.
+    """Simulates several runs for a block of ticks, or until all of them have ended.
 
     Args:
         first: First tick of the block.

@@ -53,7 +53,7 @@ _LLVM_KINDS = {
 
 
 class LaneVector(types.Type):
-    """Numba's type of a number of eight runs.
+    """Numba's type of eight numbers, one for each of eight runs, in one vector register.
 
     Args:
         kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.
@@ -71,12 +71,12 @@ class LaneVector(types.Type):
         return "LaneVector", (self.kind,)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """A number that is equal in all runs can stand for a vector of floats."""
+        """Lets Numba use one number, equal in all runs, where eight floats are needed."""
         is_number = isinstance(other, types.Float | types.Integer)
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """A variable that is a vector in one branch, and a number in another, is a vector."""
+        """Makes a variable a vector if one branch assigns a vector and another a number."""
         is_number = isinstance(other, types.Float | types.Integer)
         return self if is_number and self.kind == "f8" else None
 
@@ -293,18 +293,18 @@ class _GroupType(types.Type):
 
 
 class RowsInGroup(_GroupType):
-    """Type of all rows of a table in eight lanes."""
+    """Numba's type of all rows that belong to eight adjacent lanes."""
 
 
 class RowInGroup(_GroupType):
-    """Type of one row of a table in eight lanes."""
+    """Numba's type of one row in eight adjacent lanes, whose numbers are `LaneVector`."""
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the field of a name, or None."""
+        """Returns the field with this name, or None if the row has none."""
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is equal in all lanes, or None."""
+        """Returns the value of a field if it is the same in all lanes, else None."""
         return dict(self.constants[0]).get(name)
 
 

@@ -26,11 +26,18 @@ from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
-    """A run in lanes cannot continue, because an arm left its limits or a law failed."""
+    """Error if a run and its twins cannot continue in lanes.
+
+    An arm left its limits, or a control law failed. The caller then repeats the runs one by
+    one.
+    """
 
 
 def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> bool:
-    """Returns True if a run and its twins are to be computed in lanes.
+    """Returns True if a run and its twins are computed faster together than one by one.
+
+    This requires that lanes support the run, and that the runs are long enough for the
+    compilation of the code, unless the code exists.
 
     Args:
         run: The run before its first tick.
@@ -45,7 +52,7 @@ def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> 
 
 
 class TwinLanes(LaneRun):
-    """A run and its twins in lanes. The run is in lane 0.
+    """A run and its twins (slightly displaced copies), each in a lane. The run is in lane 0.
 
     Args:
         run: The run before its first tick, which does not advance. See `suits_twins`.
@@ -141,7 +148,7 @@ class TwinLanes(LaneRun):
 
 
 class LaneTwin:
-    """One run in the lanes of a run and its twins, with the methods of `FusedRun` for twins.
+    """One of the runs in `TwinLanes`, with those methods of `FusedRun` that twins need.
 
     Args:
         lanes: The run and its twins.
