@@ -35,7 +35,10 @@ Users send "stop", "enable" and "reset". The site itself causes the others, for 
 class RecordedChange(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
 ):
-    """Change of a link or of dominance factors, or a command to a site, without its checks.
+    """Change during a run as a record states it, for example a new delay of a link.
+
+    The change may also be one of dominance factors, or a command to a site. The values are not
+    checked.
 
     Exactly one of `link`, `dominance` and `site` is not empty. `scenario_types.Change` is the
     change that a scenario has checked.

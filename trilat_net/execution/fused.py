@@ -79,7 +79,7 @@ def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 
 
 def scale_differences(x: Array, y: Array, factor: float) -> Array:
-    """Returns y + factor (x - y), the numbers x with their differences from y scaled.
+    """Changes the distance between the numbers of two runs by a factor: y + factor (x - y).
 
     Args:
         x: Numbers of a run.
@@ -757,7 +757,7 @@ class FusedRun:
 
     @property
     def programmed_sites(self) -> set[int]:
-        """Indices of the sites of these programs."""
+        """Indices of the sites whose operator or arm is a user's program."""
         return {*self._hands, *self._plants}
 
     def copy_state(self, other: "FusedRun") -> None:

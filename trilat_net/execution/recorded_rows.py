@@ -107,7 +107,9 @@ def _find_samples(
 
 
 class PlainRows:
-    """Records of one site, prepared for the compiled loop.
+    """Reads records of one site in blocks that compiled code can execute again.
+
+    A record is plain if all inputs of its tick are in the log.
 
     Args:
         part: Records of the site.
@@ -134,11 +136,11 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the boot in a record, the number that identifies a start of the site."""
+        """Returns the number in a record that identifies a start of the site."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts the plain records from a row on, at most `BLOCK_ROWS`.
+        """Counts how many records from a row on can be executed in one block.
 
         The first of these records must belong to the present start of the site, and to the
         next tick.
@@ -265,5 +267,5 @@ def _read_plants(block: IndexedRecords) -> Array:
 
 
 def can_repeat(site: Site) -> bool:
-    """True if the compiled loop can execute the ticks of a site."""
+    """True if compiled code can execute recorded ticks of a site again."""
     return not site.parts.has_user_law

@@ -35,7 +35,7 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlL
 
 
 class Adaptive(ControlLaw):
-    """The paper's adaptive law, Eq. (13) and (15).
+    """Adaptive law of the paper, which learns the dynamics of its arm, Eq. (13) and (15).
 
     The loop is stable for any constant delays without external torque, if the dominance matrix
     is irreducible and the matrices Kd of all sites differ by scalar factors only (the paper's

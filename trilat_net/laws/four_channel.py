@@ -85,7 +85,7 @@ def _send_acceleration(law: Any, now: LawInput) -> None:
 
 @compiled
 class FourChannel(ControlLaw):
-    """Positions and forces in both directions, with known gravity.
+    """Couples arms by positions and forces in both directions, with known gravity.
 
         tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
               + force_peer felt + force_own tau_h

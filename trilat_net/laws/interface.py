@@ -44,7 +44,7 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """Facts about a site, the process that runs one arm, for which gains are tuned.
+    """Facts about one arm whose gains are tuned, for the method `write_control` of a law.
 
     The method `write_control` of a law receives them.
 
@@ -67,7 +67,7 @@ class TuningSite(NamedTuple):
 
 
 class TuningRun(NamedTuple):
-    """The motion of all arms in a run for which gains are tuned.
+    """Motion of all arms in a run for which gains are tuned, for `target_motion` of a law.
 
     The method `target_motion` of a law receives it. The run has N sites, n joints per arm, and
     K times at equal distances.

@@ -20,7 +20,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 
 class PD(ControlLaw):
-    """P+d with known gravity: tau = G(q) - K e - d qd.
+    """Spring to the other arms, damper and known gravity: tau = G(q) - K e - d qd.
 
     The error e is the position less the reference, which is the position of the peers, weighted
     by the dominance factors alpha. For reversible dominance factors, equal gains and one

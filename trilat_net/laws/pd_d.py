@@ -19,7 +19,7 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 
 
 class PdD(ControlLaw):
-    """PD+d with known gravity: tau = G(q) - K e - d qd - Kd ed.
+    """Spring and damper to the other arms, known gravity: tau = G(q) - K e - d qd - Kd ed.
 
     G(q) is the gravity torque. The error e is the position less the reference, which is the
     position of the peers, weighted by the dominance factors; ed is its derivative. For constant

@@ -22,7 +22,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 @compiled
 class SaturatedPd(ControlLaw):
-    """P+d whose pull towards each peer saturates.
+    """Couples arms by springs whose pull is limited at any distance, and brakes each arm.
 
         tau = G - sum_j alpha_ij P tanh(K (q - q_j) / P) - d qd
 

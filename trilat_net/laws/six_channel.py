@@ -19,7 +19,7 @@ from .four_channel import FourChannel
 
 
 class SixChannel(FourChannel):
-    """Four-channel law of two users and one slave whose authority is one factor a.
+    """Lets two users share a slave arm by a single factor a, their authority.
 
     The arms exchange positions and forces as in `FourChannel`. The sites, the processes that
     run one arm each, are user 1, user 2 and the slave, in this order. The slave follows user 1

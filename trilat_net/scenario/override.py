@@ -38,7 +38,7 @@ Override = tuple[str, Any]
 
 
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Replaces each override of a whole group by overrides for its single members.
+    """Replaces an override for all sites or links by one override for each of them.
 
     An override replaces one value of a scenario, the description of an experiment. Groups are
     all sites (the processes of the arms) or all links (the connections between them). For

@@ -40,7 +40,7 @@ PROGRAM = 1
 
 
 class HandContext(NamedTuple):
-    """Facts that a hand program receives before the run.
+    """Facts about the arm that a user's program receives before it moves the arm.
 
     >>> class Still:
     ...     def __init__(self, facts: tn.HandContext) -> None:
@@ -73,7 +73,7 @@ class HandContext(NamedTuple):
 
 
 class HandView(NamedTuple):
-    """The knowledge of a site at a tick, as its hand program sees it.
+    """What a user's program that moves an arm may know when it makes a decision.
 
     >>> def act(self, now: tn.HandView) -> list[float]:
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
@@ -108,7 +108,7 @@ class HandView(NamedTuple):
 
 
 class HandProgram(Protocol):
-    """Interface of a program, written by a user, that moves an arm as an operator would.
+    """Interface of a user's program that moves an arm as a human operator would.
 
     The class of the program is called with two kinds of arguments: a `HandContext`, and the
     settings of the program as keyword arguments.

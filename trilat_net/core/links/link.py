@@ -58,7 +58,7 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that another control law sends, in the order in which this law reads them.
+    """Numbers that the control law of another arm sends, in the order of their use here.
 
     C is the count of these numbers. If the arrays are for several peers (the processes of other
     arms) or for several sites (the receivers), they have additional first axes.
@@ -115,7 +115,7 @@ this, and LOST is above it.
 
 
 def span_ticks(span_ns: int, rate_hz: int) -> int:
-    """Returns the number of ticks that span a time, rounded up.
+    """Returns how many ticks (control periods) a time takes, rounded up.
 
     The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
 

@@ -199,7 +199,7 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Adapts the dominance factors of a site to peers that are lost or have returned.
+    """Gives the weight of lost peers to the other peers, and returns it when they come back.
 
     A site is the process that runs one arm, and its peers are the other sites. A dominance
     factor is the weight with which the site follows a peer. The factors of lost peers are

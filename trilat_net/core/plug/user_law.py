@@ -25,7 +25,7 @@ from ..step.vectors import Vector
 
 
 class LawContext(NamedTuple):
-    """Facts that a law receives before the run.
+    """Facts about the arm and its peers that a control law receives when it is created.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
@@ -137,7 +137,7 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """Input of a law in a tick, and the places for its results.
+    """Input of a control law in one control period (tick), and the places for its results.
 
     A vector has one number per joint, or one per coordinate that the sites share.
 
@@ -238,7 +238,7 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 def call_law(
     law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
 ) -> "LawResults":
-    """Calls a law in a tick and returns its results.
+    """Calls a user's control law for one control period, and checks its results.
 
     Args:
         law: The law.
@@ -276,7 +276,7 @@ def call_law(
 
 
 class LawResults(NamedTuple):
-    """Results of a user's law in one tick, as `call_law` returns them.
+    """Results of a user's control law in one control period, as `call_law` returns them.
 
     They are the torque of each joint, the estimate of the arm's parameters, the memory that the
     law keeps for the next tick, and the numbers that it sends to its peers.

@@ -89,7 +89,7 @@ def max_over_joints(buckets: Array) -> Array:
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns the position of the first number that a law sends, among the floats of a record."""
+    """Returns the position of the numbers that a law sends, among all floats of a record."""
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
