@@ -1,7 +1,7 @@
 """Writes output files safely, checks input files, and imports optional packages.
 
-Commands write their results with these helpers, so that a crash or a mistyped path destroys
-nothing.
+Commands write their results with these helpers, so that a crash or a mistyped path does not
+destroy earlier results.
 
 Invariant:
     - An existing output is replaced only if the caller allows it with `force`.

@@ -1,7 +1,7 @@
 """Lets loops end in an orderly way after Ctrl-C or another signal that requests the end.
 
-By default, Python raises an exception at an arbitrary line. A control loop must first bring its
-arm to rest and complete its log.
+By default, Python raises an exception at an arbitrary line. A control loop or a recorder must
+not end there, but at the end of a step.
 
 Invariant:
     - Ctrl-C or another ending signal does not end the program by itself. A loop polls for the

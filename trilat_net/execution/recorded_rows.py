@@ -140,7 +140,7 @@ class PlainRows:
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts how many records from a row on can be executed in one block.
+        """Counts the records from a row on that one block can execute, at most `BLOCK_ROWS`.
 
         The first of these records must belong to the present start of the site, and to the
         next tick.

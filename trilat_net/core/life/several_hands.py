@@ -65,7 +65,7 @@ class HandArrays(NamedTuple):
 
 @leaf
 def _put_nearest_goal(lane: int, goal: Array, hands: HandArrays) -> None:
-    """Writes the goal of a lane, moved into the reachable region, see `HandReach.find_nearest`.
+    """Moves the goal of a program to the nearest point that its arm can reach.
 
     Args:
         lane: The lane.
@@ -108,7 +108,7 @@ def _advance_hands(
     rows: Array,
     actions: Array,
 ) -> None:
-    """Computes the actions of the programs in a span of ticks, which a decision may begin.
+    """Computes how each program pulls its arm in the next ticks, from its decisions.
 
     Args:
         runs: Number of runs.

@@ -93,7 +93,7 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Draws whether a sample is lost, and returns True if it is.
+    """Returns True if a sample is lost, as random numbers decide.
 
     Args:
         sample: Index of the sample.

@@ -206,7 +206,7 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Files the numbers that the law of a peer sent with a sample in a page of the calendar.
+    """Stores the numbers that a peer's control law sent with a sample, until its use.
 
     A peer is the site at the sending end of the link. The numbers wait together with the sample
     until its delay has passed.
@@ -225,7 +225,7 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Brings the numbers that a peer's law sent with a released sample into use.
+    """Passes the numbers that a peer's law sent with a sample to this law.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.

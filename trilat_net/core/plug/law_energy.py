@@ -1,10 +1,9 @@
-"""Describes the energies with which a control law proves that it is passive.
+"""Defines the account of energy by which a control law shows that it never produces energy.
 
-A control law is passive if it never gives more energy than it received. Some laws keep an
-account of their energy: the energy that they sent to other arms, took from other arms, stored
-and dissipated. Such a law has a method that computes this account from the records of a run,
-which contain the numbers of each period of the control loop. After the run, a check compares
-the account with the motion of the arms.
+Such a law is called passive: a delay in the network cannot feed energy into the arms. Some laws
+count the energy that they sent to other arms, took from other arms, stored and dissipated. They
+have a method that computes this account from the records of a run, which contain the numbers of
+each control period. A check then compares the account with the motion of the arms.
 
 Invariant:
     - The energy that arm i takes from arm j is never more than the energy that the law of arm j

@@ -1,8 +1,8 @@
-"""Defines the setup of a site: all numbers and names that are needed to run one arm.
+"""Defines the setup of an arm: all numbers and names that are needed to run its control loop.
 
-A site is a process that runs one arm and its control loop. The setup is derived from a
-scenario, the file that describes an experiment. In contrast to the scenario, the setup has no
-missing values, and refers to other sites by index instead of name.
+The setup is derived from a scenario, the file that describes an experiment. In contrast to the
+scenario, the setup has no missing values, and refers to other arms by index instead of name. An
+arm with its control loop is called a site.
 
 Invariant:
     - All numbers that a site computes depend only on its setup and on the inputs of its control

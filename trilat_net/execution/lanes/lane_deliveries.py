@@ -205,7 +205,7 @@ def _draw_uniform_delays(
 
 @lane_leaf
 def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -> None:
-    """Draws the two random numbers that decide on the loss of each of several samples.
+    """Draws two random numbers for each of several samples, which decide whether it is lost.
 
     Args:
         first: Index of the first sample.

@@ -49,7 +49,7 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the samples that are used in a span of ticks, which differs from lane to lane.
+    """Computes which samples all runs use in their next ticks, which differ from lane to lane.
 
     Args:
         runs: Number of runs.
@@ -94,7 +94,7 @@ def _use_samples_of_lanes(
 def _put_actions(
     actions: Array, hand_row: int, columns: IntArray, actors: Array, runs: int
 ) -> None:
-    """Writes the actions of all programs in a tick into the rows of their operators.
+    """Passes the actions of all programs in a tick to the operators of the simulated arms.
 
     Args:
         actions: The actions, shape (5, LANES).
@@ -133,7 +133,7 @@ def _run_span(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Steps all sites of several runs through a span of ticks, as `run_block` does.
+    """Simulates several runs for some ticks, like `run_block` but with a clock for each run.
 
     Args:
         first: First tick of each run, shape (LANES,).
@@ -335,7 +335,7 @@ class LaneEpisodes(LaneRun):
         self.runs[lane] = run
 
     def _load_links(self, lane: int, run: FusedRun) -> None:
-        """Puts the links of a run into a lane, and makes room for them if necessary."""
+        """Copies the state of a run's network links into a lane, which may enlarge the arrays."""
         tables = run.memory.tables
         links = self._deliveries
         pages = tables.calendars.shape[2]
@@ -411,7 +411,7 @@ class LaneEpisodes(LaneRun):
         self._step_span(count, idle)
 
     def _step_span(self, count: int, idle: IntArray) -> None:
-        """Steps the runs through a span of ticks, with the actions of their programs.
+        """Simulates all runs for some ticks, with the actions of their programs.
 
         Args:
             count: Number of ticks.

@@ -69,7 +69,7 @@ class LaneLaw(NamedTuple):
 
 
 class _LawMethod(NamedTuple):
-    """The method of a law that computes its torque, and the layouts of its arrays."""
+    """Method `torque` of a control law, and the data types of its arrays."""
 
     torque: Callable[..., Any]
     form: LawForm
@@ -82,7 +82,7 @@ _user_law_numbers = count()
 
 @cache
 def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
-    """Returns a name for a law, and whether its code may be stored under this name."""
+    """Returns a name for the code of a law, and whether the code may be stored on disk."""
     sources = digest_sibling_sources(torque)
     text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
     name = hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -145,7 +145,7 @@ class LawCode(types.Type):
 
 @register_model(LawCode)
 class _CodeModel(models.PrimitiveModel):
-    """The value is a pointer, which is not used."""
+    """Represents a `LawCode` in machine code by a pointer that is not used."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -154,7 +154,7 @@ class _CodeModel(models.PrimitiveModel):
 def _make_view(
     dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
 ) -> Any:
-    """Returns a compiled function that reads the numbers of a row as rows of another layout.
+    """Returns a compiled function that reads the numbers of a row as a row with named fields.
 
     Args:
         dtype: Layout of the rows. None if there are no such rows.
@@ -184,7 +184,7 @@ def _make_view(
 
 @register_jitable
 def _no_rows(_numbers: Any) -> tuple[()]:
-    """Returns no rows, in place of a view of rows."""
+    """Returns nothing, in place of the vectors that a law of this kind does not exchange."""
     return ()
 
 
@@ -240,11 +240,11 @@ def _compute_nothing(
     _received: Any,
     _sent: Any,
 ) -> None:
-    """Form of `compute_law` for a site whose law is a part of the kernel."""
+    """Version of `compute_law` that does nothing: the kernel computes the law of this site."""
 
 
 def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the form of `compute_law` for the law of a site."""
+    """Returns the version of `compute_law` for the law of a site."""
     code = argument_types[0]
     if code.law_name == NO_LAW:
         return _compute_nothing

@@ -106,7 +106,7 @@ class LaneTable(types.Type):
 
 
 class _PartOfTable(LaneTable):
-    """Type of a part of a table in one lane, with the fields of the table."""
+    """Numba's type of some rows of a `LaneTable` in one lane."""
 
     def __init__(self, table: LaneTable, constants: tuple[Constants, ...]) -> None:
         self.fields = table.fields
@@ -151,7 +151,7 @@ class LaneNumbers(types.Type):
 @register_model(LaneNumbers)
 @register_model(LaneTable)
 class _TableModel(models.PrimitiveModel):
-    """A table is represented by a pointer."""
+    """Represents a `LaneTable` in machine code by a pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -160,7 +160,7 @@ class _TableModel(models.PrimitiveModel):
 @register_model(RowsInLane)
 @register_model(LaneRow)
 class _RowModel(models.StructModel):
-    """Rows in a lane are represented by a pointer to the first row and a lane's index."""
+    """Represents rows in a lane in machine code by a pointer and the lane's index."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         members = [("pointer", types.voidptr), ("lane", types.intp)]
@@ -168,7 +168,7 @@ class _RowModel(models.StructModel):
 
 
 def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
-    """Generates the address that lies so many bytes behind a pointer."""
+    """Generates LLVM code for an address that lies a number of bytes behind a pointer."""
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
 
 
@@ -188,7 +188,7 @@ def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
 
 @infer_getattr
 class _RowAttributes(AttributeTemplate):
-    """Types of the fields of a row in a lane."""
+    """Tells Numba the type of `row.field` for a row in a lane."""
 
     key = LaneRow
 
@@ -204,7 +204,7 @@ class _RowAttributes(AttributeTemplate):
 
 @infer_getattr
 class _RowsAttributes(AttributeTemplate):
-    """Rows in a lane have the shape (count,)."""
+    """Tells Numba the type of `rows.shape`, which is (count,), for rows in a lane."""
 
     key = RowsInLane
 
@@ -215,7 +215,7 @@ class _RowsAttributes(AttributeTemplate):
 def _find_number(
     context: Any, builder: Any, row_type: LaneRow, row_value: Any, field: LaneField
 ) -> Any:
-    """Generates the address of the first number of a field in the lane of a row."""
+    """Generates LLVM code for the address of a field's first number in a lane."""
     row = cgutils.create_struct_proxy(row_type)(context, builder, value=row_value)
     word = row.lane.type
     in_lane = builder.mul(row.lane, ir.Constant(word, _WORD))
@@ -227,7 +227,7 @@ def _find_number(
 
 @lower_getattr_generic(LaneRow)
 def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
-    """Generates the reading of a field: a constant, a number, or a view of an array."""
+    """Generates LLVM code for reading `row.field`: a constant, a number or an array."""
     constant = row_type.find_constant(name)
     if constant is not None:
         return context.get_constant(types.int64, constant)
@@ -262,7 +262,7 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
 
 @lower_setattr_generic(LaneRow)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Generates the writing of a number."""
+    """Generates LLVM code for writing a number to `row.field`."""
     row_type, value_type = sig.args
     row, value = args
     field = row_type.find_field(name)
@@ -273,7 +273,7 @@ def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> 
 
 @lower_getattr_generic(RowsInLane)
 def _read_shape(context: Any, builder: Any, rows: RowsInLane, _value: Any, _name: str) -> Any:
-    """Generates the shape of rows in a lane, which is a constant."""
+    """Generates LLVM code for `rows.shape` of rows in a lane, which is a constant."""
     count = context.get_constant(types.intp, rows.count)
     return context.make_tuple(builder, types.UniTuple(types.intp, 1), [count])
 
@@ -286,7 +286,7 @@ def _find_row(
     index: Any,
     row_type: Any,
 ) -> Any:
-    """Generates the row of an index, of the type `row_type`."""
+    """Generates LLVM code for the row with an index, of the type `row_type`."""
     rows = cgutils.create_struct_proxy(rows_type)(context, builder, value=rows_value)
     row = cgutils.create_struct_proxy(row_type)(context, builder)
     row_bytes = ir.Constant(index.type, rows_type.row_length * LANES * _WORD)
@@ -297,7 +297,7 @@ def _find_row(
 
 @infer_global(operator.getitem)
 class _RowsItem(AbstractTemplate):
-    """The type of `rows[index]`, if all rows have the same constants."""
+    """Tells Numba the type of `rows[index]`, if all rows have the same constants."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
@@ -311,13 +311,13 @@ class _RowsItem(AbstractTemplate):
 
 @lower_builtin(operator.getitem, RowsInLane, types.Integer)
 def _get_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Generates `rows[index]`."""
+    """Generates LLVM code for `rows[index]`."""
     return _find_row(context, builder, sig.args[0], args[0], args[1], sig.return_type)
 
 
 @infer_global(len)
 class _RowsLength(AbstractTemplate):
-    """The type of `len(rows)`."""
+    """Tells Numba the type of `len(rows)`."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         (rows,) = args
@@ -326,13 +326,13 @@ class _RowsLength(AbstractTemplate):
 
 @lower_builtin(len, RowsInLane)
 def _get_length(context: Any, _builder: Any, sig: Any, _args: Any) -> Any:
-    """Generates `len(rows)`, which is a constant."""
+    """Generates LLVM code for `len(rows)`, which is a constant."""
     return context.get_constant(types.intp, sig.args[0].count)
 
 
 @intrinsic
 def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
-    """Generates the rows of a table in one lane."""
+    """Generates LLVM code for the rows of an array that belong to one lane."""
     rows_type = RowsInLane(table, table.constants)
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
@@ -345,7 +345,7 @@ def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _select_row(_context: Any, rows: Any, index: Any) -> Any:
-    """Generates the row of an index that is known to the compiler."""
+    """Generates LLVM code for a row whose index is known to the compiler."""
     if not isinstance(index, types.IntegerLiteral):
         return None
     number = index.literal_value
@@ -360,7 +360,7 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
 
 @intrinsic
 def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
-    """Generates the integer of a lane, or the integer that all lanes share."""
+    """Generates LLVM code for the integer of one lane, which all lanes may share."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         numbers_type = sig.args[0]
@@ -378,7 +378,7 @@ def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
 
 @intrinsic
 def _pointer_to(_context: Any, address: Any) -> Any:
-    """Generates the conversion of an address to a pointer."""
+    """Generates LLVM code for the conversion of an address to a pointer."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())

@@ -214,7 +214,7 @@ def choose_code(layout: LaneLayout) -> Callable[..., None]:
 
 
 def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -> IntArray:
-    """Compiles the code of each site of a run, or loads it, and returns its addresses.
+    """Returns the addresses of the code for a tick of each site, and compiles it if needed.
 
     Args:
         run: The run.
@@ -303,7 +303,7 @@ def has_lane_code(run: FusedRun) -> bool:
 
 
 class _LinksOfRun:
-    """The links of a run in a lane, which are brought up to date only if the run needs them.
+    """Brings the network links of a run up to date, but only if the run needs them.
 
     Args:
         run: The run before its first tick.
@@ -328,7 +328,7 @@ class _LinksOfRun:
         self._run.pending_deliveries = partial(self._update, ticks, links, states, received)
 
     def _update(self, ticks: int, links: NDArray[Any], states: Array, received: Array) -> None:
-        """Brings the links of the run up to date, see `set_pending`."""
+        """Computes the state of the links up to the tick that `set_pending` noted."""
         memory = self._run.memory
         tables = memory.tables
         repeat_deliveries(
@@ -548,7 +548,7 @@ class LaneRun:
         )
 
     def _step_to(self, ticks: int) -> None:
-        """Steps all runs until they have made a number of ticks, or have ended.
+        """Simulates all runs until they have made a number of ticks, or have ended.
 
         Args:
             ticks: Number of ticks since the start of the runs.
@@ -583,7 +583,7 @@ class LaneRun:
             self._ticks += count
 
     def _list_present(self) -> EndedRuns:
-        """Returns the tables of all runs now, see `keep_ended_runs`."""
+        """Returns the present state of all runs, as `keep_ended_runs` reads it."""
         return EndedRuns(
             ticks=self._ended.ticks,
             site_rows=self._site,
@@ -725,7 +725,7 @@ def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the rows of site i of a table with the same number of rows for each site."""
+    """Returns the rows that belong to site i. Each site has the same number of rows."""
     rows = len(table) // sites
     return table[i * rows : (i + 1) * rows]
 

@@ -70,12 +70,12 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Form of `torque_on_arm` for an arm without operators and environments."""
+    """Version of `torque_on_arm` for an arm without operators and environments."""
     return NO_TORQUE
 
 
 def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
-    """Returns a form of `torque_on_arm` for a number of operators and environments.
+    """Returns a version of `torque_on_arm` for a fixed number of operators and environments.
 
     Each of them has a kind that is known to the compiler. Therefore it is not selected by the
     variable of a loop.
@@ -105,7 +105,7 @@ def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
 
 
 def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]:
-    """Returns the form of `torque_on_arm` for given types of its arguments."""
+    """Returns the version of `torque_on_arm` for the types of the arguments."""
     actors = argument_types[4]
     return _unroll_sources(actors.count)
 

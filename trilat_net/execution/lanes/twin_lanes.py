@@ -102,7 +102,7 @@ class TwinLanes(LaneRun):
             raise LaneEndedError
 
     def _use_samples(self, first: int, count: int) -> int:
-        """Finds the samples that all runs use in a block of ticks."""
+        """Computes which samples the runs use in a block of ticks: all use the same."""
         if self._feed.first.shape[2] == 0:
             age = super()._use_samples(first, count)
         else:
@@ -196,7 +196,7 @@ class LaneTwin:
         return float(np.abs(difference).max())
 
     def _find_columns(self, field: str) -> slice:
-        """Returns the words of a field in the row of a site."""
+        """Returns the indices of a field's numbers among all numbers of a site's row."""
         fields: Any = self._lanes._layout.site.fields
         dtype, offset, *_ = fields[field]
         return slice(offset // 8, (offset + dtype.itemsize) // 8)
