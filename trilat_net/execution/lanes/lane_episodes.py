@@ -335,7 +335,7 @@ class LaneEpisodes(LaneRun):
         self.runs[lane] = run
 
     def _load_links(self, lane: int, run: FusedRun) -> None:
-        """Copies the state of a run's network links into a lane, which may enlarge the arrays."""
+        """Copies the state of a run's network links into a lane, and enlarges the arrays."""
         tables = run.memory.tables
         links = self._deliveries
         pages = tables.calendars.shape[2]
