@@ -1,4 +1,4 @@
-"""Entry point of `trilat` and `python -m trilat_net`.
+"""Runs the command `trilat`, also as `python -m trilat_net`.
 
 `trilat stop` runs before the modules of the other commands are loaded, so that arms stop
 without delay.

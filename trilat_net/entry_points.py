@@ -1,14 +1,12 @@
 """Finds the commands, functions and viewers that other installed packages add to this program.
 
-A package adds them by entry points, a section of its pyproject.toml that names objects
-(docs/develop/packages.md). This program reads the names without importing the package. It
-imports an object when somebody uses it.
-
-Packages of this program, such as trilat-studies, do the same. `package_names` lists what
-belongs to them, so that the program can say which package to install if it is missing.
+For example, a package can add `trilat log lag`. It lists the command in its pyproject.toml as
+an entry point, which is the name of an object (docs/develop/packages.md). This program reads
+the names without importing the package, and imports the object when somebody uses it. Optional
+packages of this program, such as trilat-studies, add their commands in the same way.
 
 Invariant:
-    - What this program has under a name itself is never replaced.
+    - A name that this program defines itself is never replaced.
     - A name of a package of this program is never taken from another package.
 """
 

@@ -1,8 +1,8 @@
-"""What a package of somebody else may use to add commands to `trilat`.
+"""Lets other packages add commands to `trilat`: the names that they may import.
 
-A package registers a command by an entry point (docs/develop/packages.md). The function of the
-command is declared with `command`. These names stay, as those of `trilat_net` do. All other
-modules of this program may change.
+A package declares the function of its command with `command`, and registers the command as an
+entry point (docs/develop/packages.md). The names of this module and of `trilat_net` stay the
+same in later versions. All other modules of this program may change.
 """
 
 from .app.cli.options import (

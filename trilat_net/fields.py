@@ -1,9 +1,9 @@
-"""Base class and number types of the tables that a scenario consists of.
+"""Defines the types of the values in a scenario, and the base class of its tables.
 
 A scenario is a TOML file that describes an experiment with several robot arms. Each of its
-tables becomes an object of a subclass of `Frozen`. Annotations such as `Positive` limit the
-range of a number. Annotations such as `Joints` say how many numbers a vector has, for example
-one per joint of the arm. `scenario.key_checks` checks what these types do not state.
+tables becomes an object of a subclass of `Frozen`. Annotations say what a value may be:
+`Positive` limits the range of a number, and `Joints` requires one number per joint of the arm.
+`scenario.key_checks` checks what these types do not state.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it.
@@ -36,15 +36,15 @@ K = TypeVar("K", bound=Frozen)
 
 
 def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the subclasses of a base class that the files of a package define.
+    """Yields the classes that a scenario can select by name, as in `kind = "wall"`.
 
-    Each subclass is a kind that a scenario can select by the tag of the class, as in
-    `kind = "wall"`. Classes without a tag are only bases of others, and are left out. The order
-    is that of the files, and of the positions in each file.
+    To add a kind, add a file to the package; there is no other list. Classes without a tag
+    (name) of their own are only bases of others, and are left out. The order is that of the
+    files, and of the positions in each file.
 
     Args:
         package: Dotted name of the package whose files are searched.
-        base: The base class, for example that of all control laws.
+        base: Base class of the kinds, for example that of all control laws.
     """
     folders = import_module(package).__path__
     for file in pkgutil.iter_modules(folders):

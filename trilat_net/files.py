@@ -1,12 +1,14 @@
-"""Helpers for output files and folders, input files, and optional packages.
+"""Writes output files safely, checks input files, and imports optional packages.
+
+Commands write their results with these helpers, so that a crash or a mistyped path does not
+destroy earlier results.
 
 Invariant:
     - An existing output is replaced only if the caller allows it with `force`.
     - A file or folder gets its final name only when it is complete. A program that dies while
       it writes therefore leaves no output that looks complete.
-    - An output is never written through a symbolic link. Otherwise, the author of the link
-      could choose which file is overwritten. The rule also holds for the folders that the
-      program makes within an output folder.
+    - An output is never written through a symbolic link, also within an output folder.
+      Otherwise, the author of the link could choose which file is overwritten.
     - An optional package is imported where it is used. If it is missing, the error names the
       command that installs it.
 """

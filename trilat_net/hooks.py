@@ -1,20 +1,18 @@
-"""Finds functions and classes when they are first used: hooks, and the names of an interface.
+"""Lets a package call a function of a package that it must not import.
 
-A hook lets a lower package call a function of an upper package without naming that package.
+A package may import only packages of lower layers. Nevertheless `Log.plot`, a method of a low
+layer, needs the drawing functions of the higher package `presentation`. Therefore
+`presentation` registers its function here under the name of its purpose, and the method looks
+up this name with `find_hook`. Such a registered function is called a hook.
 
-A package may import only packages below it. A method of a low package may nevertheless need a
-function from above: the records of a run, for example, can draw themselves with `Log.plot`, and
-drawing is the task of the package `presentation`. The upper package registers such a function
-here under the name of its purpose, and the method looks it up by this name.
-
-The interface of a package is `__all__` in its `__init__.py`. Other packages import its names
-from the package (`import_on_use`).
+`import_on_use` serves the `__init__.py` of packages: it imports a module only when somebody
+uses one of its names, so that programs start fast.
 
 Invariant:
     - Registering imports nothing. The module of a function is imported when the function is
-      first looked up, so that commands which do not need it start fast.
+      first looked up.
     - `trilat_net/__init__.py` imports every package that registers functions. All hooks are
-      therefore filled before any other module of the program is imported.
+      therefore known before any other module of the program is imported.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,7 +1,8 @@
-"""Lists which commands and functions belong to which package of this program.
+"""Lists the commands and functions of the optional packages, such as trilat-studies.
 
-The packages register them by entry points themselves (`entry_points`). The lists give the order
-of the help, and name the package to install if it is missing.
+If a user calls `trilat sweep` and trilat-studies is missing, this program must know the command
+to say what to install. The lists also give the order of the commands in the help. The packages
+register the commands themselves (`entry_points`).
 """
 
 PACKAGE_COMMANDS = {

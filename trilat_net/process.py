@@ -1,9 +1,12 @@
-"""Settings of this process: garbage collection and priority.
+"""Keeps the process of a control loop on time: its priority, and Python's garbage collector.
+
+A control loop must not wait for other programs or for Python's garbage collector.
+`request_real_time_scheduling` and `raise_priority` address the first, `disable_gc` and
+`freeze_gc` the second. `pause_gc` makes code faster that creates many objects.
 
 Invariant:
-    - Garbage collection pauses only around code that creates many objects without reference
-      cycles, such as records and lists of numbers. Collecting them would cost time and free
-      nothing.
+    - `pause_gc` is used only around code that creates many objects without reference cycles,
+      such as records and lists of numbers. Collecting them would cost time and free nothing.
 """
 
 import gc

@@ -1,8 +1,9 @@
-"""Describes the changes of a run as its records state them.
+"""Defines how a log states what changed during a run, for example the delay of a network link.
 
-A record is the result of one tick, a period of a site's control loop. It contains the JSON text
-of every change that the site applied in the tick. Programs that only forward or store records
-read these texts without the scenario.
+Each site, the control process of one arm, stores a record in each control period. The record
+contains the JSON text of every change that the site applied in the period. Programs that only
+forward or store records can read these texts with the types of this module, without the
+scenario (the description of the experiment).
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,10 @@ Users send "stop", "enable" and "reset". The site itself causes the others, for 
 class RecordedChange(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
 ):
-    """Change of a link or of dominance factors, or a command to a site, without its checks.
+    """Change during a run as a record states it, for example a new delay of a link.
+
+    The change may also be one of dominance factors, or a command to a site. The values are not
+    checked.
 
     Exactly one of `link`, `dominance` and `site` is not empty. `scenario_types.Change` is the
     change that a scenario has checked.

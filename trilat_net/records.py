@@ -1,9 +1,9 @@
-"""Describes the records and samples of a tick, which the kernel, the network and the log share.
+"""Defines the record of a control period, and the state that an arm sends to the others.
 
-A site is a process that runs one arm, and a tick is one period of its control loop. The kernel
-computes the record of a tick, the network sends it, and the log stores it. The modules that
-send and store records import these types from here. Therefore they need neither the kernel nor
-its compiler.
+Each arm is controlled by a process called a site, in periods called ticks. The kernel computes
+the record of a tick, the network sends it, and the log stores it. All of them use the types of
+this module. Programs that only send or store records therefore need neither the kernel nor its
+compiler.
 
 Invariant:
     - This module imports nothing of the program.
@@ -76,7 +76,9 @@ class Arrival(NamedTuple):
 
 
 class TickRecord(NamedTuple):
-    """The record of one tick: the state AT t_k and its consequences, never the advanced state.
+    """Results of one control period (tick): the state at its start, and what follows from it.
+
+    The state at the end of the period is not included: it belongs to the next record.
 
     Attributes:
         tick: k.
@@ -133,7 +135,7 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the part of the record that peers receive: their view of this site's arm.
+        """Returns the part of the record that an arm sends to the other arms.
 
         In task space it refers to the end effector, otherwise to the joints.
 
@@ -172,7 +174,7 @@ class Layout(NamedTuple):
     bodies: int = 0
 
     def axes(self) -> dict[str, int]:
-        """Returns the lengths of the named axes that fields of the state arrays have.
+        """Returns the sizes of the named dimensions of state arrays, for example "joints": 2.
 
         The names are "joints", "shared" and "parameters", see `core.step.row_fields`.
         """
@@ -194,7 +196,7 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Finds each vector of a record among the values that a control period computes.
+        """Finds the position of each vector among all computed numbers of a record.
 
         Returns:
             A slice for each vector, by name. Vectors that are inputs of the period are left

@@ -1,12 +1,12 @@
-"""Defines the result of a command: an object that can become a line, a text, a table or JSON.
+"""Defines what commands and functions return: objects that become text, a table or JSON.
 
-The commands of the terminal and the functions of the Python interface return the same objects.
-The terminal prints the text, and programs read the values.
+The commands in the terminal and the functions of the Python interface return the same objects.
+The terminal prints `summary()`, and programs read the values or call `to_dict()`.
 
 Invariant:
-    - A result contains only values. Its text is composed by functions that the package
-      `presentation` registers in `hooks`, and that are imported when the text is requested.
-      Modules that compute therefore do not depend on modules that format.
+    - A result contains only values. Modules that compute therefore do not depend on modules
+      that format: the package `presentation` registers the functions that compose texts in
+      `hooks`.
     - JSON contains no NaN and no infinity. An unknown quantity is null.
 """
 

@@ -1,4 +1,7 @@
-"""Handles the signals that request the end of the program, such as that of Ctrl-C.
+"""Lets loops end in an orderly way after Ctrl-C or another signal that requests the end.
+
+By default, Python raises an exception at an arbitrary line. A control loop or a recorder must
+not end there, but at the end of a step.
 
 Invariant:
     - Ctrl-C or another ending signal does not end the program by itself. A loop polls for the

@@ -1,6 +1,9 @@
-"""Starts worker processes, each of which computes a part of a large task.
+"""Starts worker processes, which compute the parts of a large task at the same time.
 
-The parts, for example the runs of a sweep, are computed at the same time.
+For example, a parameter sweep gives each of its runs to one of the workers:
+
+    with worker_pool(count_cores()) as pool:
+        results = list(pool.map(compute_run, settings))
 
 Invariant:
     - Worker processes ignore Ctrl-C, and leave it to the process that started them. They end

@@ -1,14 +1,15 @@
-"""Contains the core, which computes one tick (period) of the control loop of one site.
+"""Computes one period of the control loop of a robot arm: the computing core of the program.
 
-A site is a process that runs one arm. The core comprises the arms, the control laws, the links
-between sites, and the step of a site. README.md in this folder describes the stages of a tick,
-the state of a site, and each file.
+Live sessions, simulations and the verification of logs all call this package. It contains the
+models of the arms, the simulated network links between them, and the function that computes one
+period (called a tick). README.md in this folder describes the stages of a tick and each file.
 
 Invariant:
 
-- Nothing in this package reads a clock, opens a socket or logs. All random numbers are seeded
-  by the scenario, the file that describes an experiment. Only `jit` and `plugged` use files,
-  for compiled code.
+- Nothing in this package reads a clock, opens a socket or logs. Equal inputs therefore give
+  equal results.
+- All random numbers follow from a seed in the scenario, the file that describes an experiment.
+- Only `jit` and `plugged` use files, for compiled code.
 - The package depends on the standard library, NumPy, Numba, `errors`, `hooks`, `process`,
   `records` and `signals` alone.
 """

@@ -1,4 +1,9 @@
-"""Executes sites in virtual time: anew, from a log, or from a log with changed settings."""
+"""Simulates experiments, and executes the runs of logs again.
+
+`virtual` simulates an experiment without real clocks and network. `verification` executes a log
+again, to check that it is correct. `what_if` does so with other settings, to show what would
+have happened. The package `lanes` computes many simulations at once with vector instructions.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,9 +1,9 @@
-"""Simulates all arms of a scenario in one compiled loop, without writing a log.
+"""Simulates an experiment about 1000 times faster than real time, without writing a log.
 
-A scenario describes an experiment with several sites, processes that each run one arm. The
-simulation is about 1000 times faster than real time. It does not store every tick (period of
-the control loop). It stores the largest values of every interval of 50 ms, and sums over the
-run. It is used for parameter studies, and to repeat runs with a small disturbance.
+All arms of the experiment are simulated in one compiled loop. It does not store every tick
+(period of the control loop), but the largest values of every interval of 50 ms, and sums over
+the run. Parameter sweeps use this module, and so does the repetition of runs with a small
+disturbance, which shows whether they are stable.
 
 Invariant:
     - The results equal the results of `execution.virtual` with its default network, bit for
@@ -62,7 +62,9 @@ from ..scenario import PlantPlayer, Scenario, Wall, make_hand_players, refuse_ex
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Returns, for each eight bytes of a data type, whether they are a floating-point number.
+    """Marks which numbers of a row are floats and which are integers, each of eight bytes.
+
+    Only floats can be scaled (`scale_differences`).
 
     The fields of all data types of the kernel are multiples of eight bytes.
     """
@@ -77,7 +79,7 @@ def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 
 
 def scale_differences(x: Array, y: Array, factor: float) -> Array:
-    """Returns y + factor (x - y), the numbers x with their differences from y scaled.
+    """Changes the distance between the numbers of two runs by a factor: y + factor (x - y).
 
     Args:
         x: Numbers of a run.
@@ -257,7 +259,7 @@ def _make_prompt_inputs(sites: int) -> RunInputs:
 
 
 class RunMemory(NamedTuple):
-    """All arrays of a run, for drivers that compute several runs together.
+    """All arrays of a run, for modules that compute several runs together.
 
     N is the number of sites.
 
@@ -290,7 +292,7 @@ class RunMemory(NamedTuple):
 
 
 class FusedRun:
-    """Run of all sites of a scenario in one compiled loop.
+    """Simulation of all arms of a scenario in one compiled loop.
 
     A site is a process that runs one arm and its control loop. Control laws that can be
     compiled are executed within the loop. Laws in plain Python are called between the stages of
@@ -466,7 +468,7 @@ class FusedRun:
 
     @property
     def memory(self) -> RunMemory:
-        """All arrays of the run. They change while it is executed."""
+        """All arrays of the run, as views that change while the run advances."""
         return RunMemory(
             tables=self._tables,
             progress=self._progress,
@@ -755,7 +757,7 @@ class FusedRun:
 
     @property
     def programmed_sites(self) -> set[int]:
-        """Indices of the sites of these programs."""
+        """Indices of the sites whose operator or arm is a user's program."""
         return {*self._hands, *self._plants}
 
     def copy_state(self, other: "FusedRun") -> None:

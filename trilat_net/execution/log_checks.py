@@ -1,12 +1,14 @@
 """Checks a log by executing its run again, and reports one finding for each check.
 
-A log contains the inputs and the results of every period (tick) of the control loops. Therefore
-the results can be computed again. The checks answer these questions: Are records missing? Is
-the file as it was written? Which control laws of users does it name? Does a repeated execution
-give the same records? Was an arm moved by something outside of this program, such as a real
-robot? Does the scenario (the description of the experiment) have the hash that the log states?
-Does a simulation of the whole session in virtual time, without clocks and network, give the
-same records?
+A log contains the inputs and the results of every control period. Therefore the results can be
+computed again. The checks answer these questions:
+
+- Are records missing, and is the file as it was written?
+- Does the scenario, the description of the experiment, have the hash that the log states?
+- Which control laws of users does it name?
+- Does a repeated execution give the same records?
+- Does a simulation of the whole session, without clocks and network, give the same records?
+- Was an arm moved by something outside of this program, such as a real robot?
 
 Invariant:
     - Every finding about an execution is based on an execution in this process.

@@ -1,11 +1,11 @@
-"""Prepares the records of a log for the compiled loop that executes their ticks again.
+"""Converts the records of a log to arrays, so that compiled code can verify them quickly.
 
-A record is the stored result of one tick (period of the control loop) of a site. The compiled
-loop executes the ticks of plain records: consecutive ones whose inputs are all in the log. All
-other records are examined one by one, by `verify`.
+A record is the stored result of one control period (tick) of an arm. To verify a log, each tick
+is computed again. The compiled loop `TickRepeater` does so for many consecutive ticks in one
+call, if all inputs of these ticks are in the log. `verify` executes the other ticks one by one.
 
 Invariant:
-    - Only records in the exact layout that this program writes are prepared.
+    - Only records in the exact layout that this program writes are converted.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ _MASK_64 = (1 << 64) - 1
 
 
 class SampleTable(NamedTuple):
-    """Samples (states that the sites sent) of all sites of a log.
+    """The states (samples) that all sites of a log sent, for a fast look-up by site and tick.
 
     Attributes:
         bits: Position, velocity and external torque of each sample in the coordinates that
@@ -45,7 +45,7 @@ class SampleTable(NamedTuple):
 
 
 def make_sample_table(log: Log) -> SampleTable | None:
-    """Collects the samples of all sites of a log.
+    """Collects the states (samples) that all sites of a log sent, for the compiled loop.
 
     Args:
         log: The log.
@@ -107,7 +107,9 @@ def _find_samples(
 
 
 class PlainRows:
-    """Records of one site, prepared for the compiled loop.
+    """Reads records of one site in blocks that compiled code can execute again.
+
+    A record is plain if all inputs of its tick are in the log.
 
     Args:
         part: Records of the site.
@@ -134,11 +136,11 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the boot in a record, the number that identifies a start of the site."""
+        """Returns the number in a record that identifies a start of the site."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts the plain records from a row on, at most `BLOCK_ROWS`.
+        """Counts the records from a row on that one block can execute, at most `BLOCK_ROWS`.
 
         The first of these records must belong to the present start of the site, and to the
         next tick.
@@ -265,5 +267,5 @@ def _read_plants(block: IndexedRecords) -> Array:
 
 
 def can_repeat(site: Site) -> bool:
-    """True if the compiled loop can execute the ticks of a site."""
+    """True if compiled code can execute recorded ticks of a site again."""
     return not site.parts.has_user_law

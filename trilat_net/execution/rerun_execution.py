@@ -1,10 +1,12 @@
-"""Checks the request for a rerun of a log, and executes the sites of the rerun.
+"""Executes arms of a log again with changed settings, and refuses changes without effect.
 
-A site is a process that runs one arm. In each tick (period of the control loop) it sends a
-sample, its state, to the other sites. The log has one record per tick and site. A rerun
-executes some or all sites of a log again, possibly with changed settings. Only sites that are
-executed can be changed, so a setting that concerns only other sites is refused. A setting that
-concerns both kinds of sites changes only the executed sites, and the result reports this.
+A log has one record per control period (tick) for each arm. `what_if` uses this module to
+compute some or all arms again, for example with another gain at the slave. A setting that
+concerns only arms that are not executed is refused, because it would have no effect. A setting
+that concerns both kinds of arms changes only the executed ones, and the result reports this.
+
+Below, a site is the control process of an arm, and a sample is the state that a site sends to
+the others in each tick.
 
 Invariant:
     - A site advances only by `Site.step`.

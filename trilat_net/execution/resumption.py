@@ -1,13 +1,12 @@
-"""Provides the recorded inputs of a site, and restores its state in the middle of a log.
+"""Restores the state of an arm in the middle of a log, to execute the run from there.
 
-A site is a process that runs one arm. In each tick (period of its control loop) it sends a
-sample, its state, to the other sites. The log has a record for each tick, with the site's state
-and with the samples that arrived. If records are missing, the ticks of this gap cannot be
-executed again. The state of the site can be restored after the gap.
+A log has a record for each control period (tick), with the state of the arm and with the
+samples (states of other arms) that arrived. If records are missing, the ticks of this gap
+cannot be executed again. After the gap, the execution resumes from a restored state.
 
 Invariant (L3):
-    - Two consecutive records, and the samples that the site has received but not used yet,
-      suffice to restore the state of a site.
+    - Two consecutive records, and the samples that the arm has received but not used yet,
+      suffice to restore the state of the arm and its controller.
     - If records are missing, it is not known which samples arrived in these ticks. A sample
       that was sent, but is missing from all records of the receiver, is assumed to have arrived
       there.

@@ -1,14 +1,14 @@
-"""Executes twins of a run: repetitions with a small disturbance, side by side with the run.
+"""Shows whether a run is stable, by repeating it with small disturbances.
 
-The difference between a twin and the run shows whether small disturbances grow or decay. The
-disturbance is called a push: a small displacement of the state at one time.
+A repetition is called a twin, and its disturbance a push: a small displacement of the state at
+one time. If the distance between the twin and the run grows, the run is unstable.
 
-A difference that has become large is scaled down again (Benettin, Galgani, Giorgilli and
+A distance that has become large is scaled down again (Benettin, Galgani, Giorgilli and
 Strelcyn, Meccanica 15, 1980). Let x be a number of the twin's state, which includes the samples
-in transit on the network, and x_run the same number in the run. Then x is replaced by
-x_run + factor (x - x_run), with the same factor for all numbers. The total growth of the
-difference accounts for all factors, by the sum of their logarithms. If the difference has
-decayed to rounding errors, the twin is pushed again.
+in transit on the network, and x_run the same number in the run. Then x is replaced by x_run +
+factor (x - x_run), with the same factor for all numbers. The sum of the logarithms of all
+factors gives the total growth. If the distance has decayed to rounding errors, the twin is
+pushed again.
 
 Invariant:
     - The run is executed again from its recorded inputs, and compared with its records.
@@ -48,7 +48,9 @@ WINDOWS = 16
 
 
 class Push(NamedTuple):
-    """Small displacement of the state of a twin, which is a second execution of the same run.
+    """Small displacement of the state of a twin, for example by 1e-6 rad at one joint.
+
+    A twin is a second execution of the same run.
 
     The difference between the twin and the run then shows whether small disturbances grow or
     die away.
@@ -177,7 +179,7 @@ class Push(NamedTuple):
 
 
 class TwinPath(NamedTuple):
-    """Course of the difference between a twin and the run, in intervals of 50 ms.
+    """Distance between a twin and the run over time, in intervals of 50 ms.
 
     A twin is a second execution of the run in which the state received a small push. If the
     difference becomes large, it is scaled down, and if it has decayed, the twin is pushed
@@ -208,7 +210,7 @@ class TwinPath(NamedTuple):
 
 
 class Twins(NamedTuple):
-    """A run, compared with its twins.
+    """A run and slightly displaced copies of it, which show whether the run is stable.
 
     A twin is a second execution of the run in which the state received a small push. The twins
     show whether small disturbances grow or die away. `of_log` and `of_scenario` create the

@@ -1,13 +1,14 @@
-"""Runs a scenario in virtual time: without real clocks, processes or a network.
+"""Simulates an experiment without real clocks, processes or a network, and writes its log.
 
-A scenario describes an experiment with several sites, each of which controls one arm. A counter
-takes the place of the clock, and a simulated network takes the place of the message bus. The
-log of the run has the same form as the log of a live session: it contains, for every site, the
-result of every tick (period of the control loop), statistics of the links, and events.
+A counter takes the place of the clock, and a simulated network takes the place of the message
+bus. The log has the same form as the log of a live session: it contains, for every arm, the
+record of every tick (period of the control loop), statistics of the network links, and events.
+All tools for logs therefore work on simulations, too.
 
 Invariant:
-    - A site advances only by `Site.step`. Ticks are executed in the order of their nominal
-      times. Ticks of the same time are executed in the order of the sites in the scenario.
+    - An arm advances only by `Site.step`. Ticks are executed in the order of their nominal
+      times. Ticks of the same time are executed in the order of the sites (the controllers of
+      the arms) in the scenario.
     - Therefore two runs of a scenario with the same seed write the same file, byte for byte.
     - A message of an older schema version is written in the present version. A message of the
       present version keeps its bytes.

@@ -1,13 +1,14 @@
-"""Compares a log with a simulation of it, and finds late and lost samples.
+"""Compares a log with a simulation of it, to find the effect of late and lost messages.
 
-A site is a process that runs one arm. In each tick (period of its control loop) it sends a
-sample, its state, to the other sites. The scenario describes the delay of each link between two
-sites. The receiver holds a sample until this delay has passed. Then the sample is due. The log
-is compared with a simulation that has no real clocks and no real network.
+In each control period, an arm sends its state, a sample, to the other arms. The receiver holds
+a sample until a delay has passed that the scenario prescribes; then the sample is due. As long
+as the real network delivers every sample before it is due, it has no effect on the run, and a
+simulation without real network gives the same numbers. The first difference shows when the
+network was too slow.
 
 Invariant (L2):
     - A simulation in which all samples arrive when they arrived in the log equals the log in
-      every tick.
+      every tick (control period).
     - A simulation in which all samples arrive at once equals the log up to the first sample
       that was late, or was lost in the network.
 """

@@ -1,7 +1,7 @@
-"""Simulates the network between sites: in which tick of the receiver each sample arrives.
+"""Simulates when messages between arms arrive, in place of a real network.
 
-A site is a process that runs one arm. In each tick (period of its control loop) it sends a
-sample, its state, to the other sites. There are two kinds of networks:
+In each control period (tick), an arm sends its state, a sample, to the other arms. There are
+two kinds of networks:
 
 - `PromptNetwork` delivers a sample in the first tick after it was sent.
 - `RecordedNetwork` delivers a sample in the tick in which it arrived according to a log. If
@@ -9,9 +9,8 @@ sample, its state, to the other sites. There are two kinds of networks:
   ticks per second was changed, the arrivals are converted.
 
 Invariant:
-    - The delay is a property of the link between two sites (L2): the receiver holds each sample
-      until its delay has passed. A network only decides when a sample arrives. An arrival
-      before that time has no effect on the results.
+    - A network only decides when a sample arrives. The receiver then holds the sample until the
+      delay of the link has passed (L2). An arrival before that time has no effect.
     - A recorded sample is delivered in the tick in which it arrived according to the log.
     - A sample is never delivered in a tick in which it did not arrive according to the log.
       Ticks without a record, whose arrivals are estimated, are marked.

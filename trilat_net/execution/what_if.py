@@ -1,19 +1,20 @@
-"""Executes sites of a log again with changed settings, and compares the result with the log.
+"""Computes what would have happened in a recorded run with other settings.
 
-A site is a process that runs one arm, and a log contains a record of each tick, a period of its
-control loop. A rerun answers what would have happened with other settings:
+For example, one can repeat a session with a higher damping at the slave:
 
     result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     result.sites["s"].error_rms_rad, result.after["s"].q
 
-In open loop, only the replaced sites are executed; the other sites keep their records and do
-not react. In closed loop, every site is executed, and each sample (the state that a site sends
-to the others) takes as long through the network as it did in the log.
+In open loop, only the replaced sites (the controllers of arms) are executed; the other sites
+keep their records and do not react. In closed loop, every site is executed, and each sample
+(the state that a site sends to the others) takes as long through the network as it did in the
+log.
 
 Invariant:
     - Without changed settings, both modes reproduce the log, bit for bit.
     - A figure such as the mean error is computed from the log and from the rerun over the same
-      times: those for which the log contains a record and the rerun executed a tick.
+      times: those for which the log contains a record and the rerun executed a tick (control
+      period).
 """
 
 import io

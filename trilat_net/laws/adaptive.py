@@ -35,7 +35,7 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlL
 
 
 class Adaptive(ControlLaw):
-    """The paper's adaptive law, Eq. (13) and (15).
+    """Adaptive law of the paper, which learns the dynamics of its arm, Eq. (13) and (15).
 
     The loop is stable for any constant delays without external torque, if the dominance matrix
     is irreducible and the matrices Kd of all sites differ by scalar factors only (the paper's
@@ -122,12 +122,12 @@ class Adaptive(ControlLaw):
         )
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the adaptation gain Gamma is zero, so that the law learns nothing.
+        """Returns True if the law couples the arms like passive springs and dampers.
 
-        Without learning, the law acts like springs and dampers between the positions of the
-        arms. Stability conditions of laws of this kind need reversible dominance factors. The
-        dominance factor alpha_ij is the weight with which site i follows site j. The factors
-        are reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+        This requires that the adaptation gain Gamma is zero, so that the law learns nothing.
+        Stability conditions of laws of this kind need reversible dominance factors, the weights
+        alpha_ij with which site i follows site j: positive weights D_i must exist with D_i
+        alpha_ij = D_j alpha_ji.
         """
         return not any(self.Gamma)
 

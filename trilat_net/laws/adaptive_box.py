@@ -1,13 +1,13 @@
-"""Implements the paper's adaptive law with each estimated parameter kept in an interval.
+"""Implements the adaptive law with bounds: each estimated parameter is kept in an interval.
 
 The adaptive law estimates the dynamic parameters theta of its arm, such as masses and inertias.
 Without bounds, an estimate may drift as long as the errors are not zero. Here the user states a
 lowest and a highest value for each parameter (together a box), and a projection keeps the
 estimate between them. The torque is computed as in `Adaptive`, by Eq. (13) of the paper.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.project_estimate`). `AdaptiveBox.advance_estimate` states the projection in plain
-Python, and `tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
+The compiled control loop computes this law (`core.control.project_estimate`).
+`AdaptiveBox.advance_estimate` states the projection in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
 """
 
 from collections.abc import Mapping

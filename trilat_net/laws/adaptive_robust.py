@@ -22,7 +22,7 @@ from .interface import TuningSite
 
 
 class AdaptiveRobust(AdaptiveBox):
-    """The law with a box, and the robust term -rho r / sqrt(r^2 + width^2).
+    """Adaptive law with bounded estimates and a robust term -rho r / sqrt(r^2 + width^2).
 
     Premises: constant delays, no operator, theta in its box, and a disturbance of at most rho
     at each joint. Then the mean over time of the power that V, the energy function of the

@@ -1,12 +1,10 @@
-"""Defines how a control law states its stability condition and its linear form.
+"""Defines how a control law tells when it is stable, and how it behaves for small motions.
 
-The stability condition tells the user for which gains and delays the law is stable. The
-commands `trilat scenario check` and `trilat linear` print it.
-
-The linear form describes the law for small motions around a pose at rest. The linear analysis
-combines the linear forms of all sites (the processes that run one arm each) into one linear
-system with delays. A linear form is a matrix of blocks. Each block says how one quantity, for
-example the torque, depends on another, for example the position.
+- The stability condition says for which gains and delays the law is stable. The commands
+  `trilat scenario check` and `trilat linear` print it.
+- The linear form describes the law near a pose at rest, as a matrix of blocks. Each block says
+  how one quantity, for example the torque, depends on another, for example the position. The
+  linear analysis combines the forms of all arms into one linear system with delays.
 
 Invariant:
     - Each law defines both as methods of its `Settings`, the record of its gains.
@@ -43,7 +41,7 @@ class ArmLoad(NamedTuple):
 
 
 class LawSituation(NamedTuple):
-    """Facts about a session on which the stability condition of one site's law may depend.
+    """Input of a stability condition: the laws, delays and weights of all sites of a session.
 
     Attributes:
         site: Index of the site.
@@ -347,7 +345,7 @@ and "tau_h" for the torque ON the arm.
 
 
 class LinearSituation(NamedTuple):
-    """Facts about a session on which the linear form of one site's law may depend.
+    """Input of a linear form: the laws and weights of all sites, and the inertia of the arm.
 
     Attributes:
         site: Index of the site.
@@ -371,7 +369,7 @@ class LinearSituation(NamedTuple):
 
 
 class LinearForm:
-    """Control law, linearised for small motions of a site, as a matrix of blocks.
+    """Behaviour of a control law for small motions of its arm, as a matrix of blocks.
 
     For a site with n joints, each block is a matrix of n x n numbers. It says how a quantity
     (the row) depends on another (the column): for example the block ("tau", "q") is the

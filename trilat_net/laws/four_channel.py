@@ -1,10 +1,13 @@
-"""Implements the four-channel law: positions and forces go in both directions.
+"""Implements the four-channel law: arms exchange positions and forces in both directions.
 
-Each arm is pulled towards the positions of the other arms, its peers. It also receives the
-torques that operators and environments exert on the peers' arms. Both are averaged with the
-dominance factors, the weights with which an arm follows its peers. The averages are q_des
-(position), qd_des (velocity), qdd_des (acceleration) and `felt` (torque). The torque that an
-operator or environment exerts on the arm itself is tau_h.
+Each arm is pulled towards the positions of the other arms, its peers, and feels the torques
+that operators and environments exert on the peers. A user thus feels what the remote arm
+touches.
+
+The positions and torques of the peers are averaged with the dominance factors, the weights with
+which an arm follows its peers. The averages are q_des (position), qd_des (velocity), qdd_des
+(acceleration) and `felt` (torque). The torque that an operator or environment exerts on the arm
+itself is tau_h.
 
 Four gains weight the torques: `force_peer` and `force_own`, each at the master and at the
 slave. A gain of zero removes a channel. Lawrence, who introduced the law for two sites, uses
@@ -82,7 +85,7 @@ def _send_acceleration(law: Any, now: LawInput) -> None:
 
 @compiled
 class FourChannel(ControlLaw):
-    """Positions and forces in both directions, with known gravity.
+    """Couples arms by positions and forces in both directions, with known gravity.
 
         tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
               + force_peer felt + force_own tau_h

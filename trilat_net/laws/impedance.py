@@ -41,7 +41,7 @@ MOST_HANDS = 4
 
 @compiled
 class Impedance(ControlLaw):
-    """Impedance control of several users and a slave, by inverse dynamics.
+    """Makes each arm move like a mass on a spring and a damper, for several users and a slave.
 
     The law needs the arm's parameters.
 

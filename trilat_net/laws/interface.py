@@ -1,17 +1,16 @@
 """Defines the base classes of the built-in control laws, and how a scenario stores their gains.
 
-A control law computes the torque of an arm from the motion of the arm and of its peers. A law
-is written as one class whose annotated attributes are its gains. From this class a second
-class, its `Settings`, is derived: a frozen record of gains that a scenario file contains and
-that is checked when the file is read.
+A law is one class, whose annotated attributes are its gains, for example `Kd`. From this class
+a second class, its `Settings`, is derived. It is the table of gains in a scenario (the file
+that describes an experiment), and is checked when the file is read. An instance of the law
+itself computes the torques of one arm.
 
 Invariant:
-    - A law is one class. The annotations of the class are its gains, with ranges and defaults.
-    - The `Settings` of a law are derived from these annotations. They take over the methods of
-      the class that depend on gains alone, such as the stability condition.
-    - At a site, the process that runs an arm, an instance of the class computes the torques.
-      Laws that the simulation kernel (the compiled code of the control loop) computes have a
-      method `gains` instead of `torque`.
+    - The annotations of the class are its gains, with ranges and defaults.
+    - The `Settings` of a law take over the methods of the class that depend on gains alone,
+      such as the stability condition.
+    - Laws that the compiled control loop computes itself have a method `gains` instead of
+      `torque`.
 """
 
 import ast
@@ -45,7 +44,7 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """Facts about a site, the process that runs one arm, for which gains are tuned.
+    """Facts about one arm whose gains are tuned, for the method `write_control` of a law.
 
     The method `write_control` of a law receives them.
 
@@ -68,7 +67,7 @@ class TuningSite(NamedTuple):
 
 
 class TuningRun(NamedTuple):
-    """The motion of all arms in a run for which gains are tuned.
+    """Motion of all arms in a run for which gains are tuned, for `target_motion` of a law.
 
     The method `target_motion` of a law receives it. The run has N sites, n joints per arm, and
     K times at equal distances.
@@ -113,7 +112,7 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def plugged(self) -> bool:
-        """True if the class of the law computes the torque.
+        """True if the class of the law computes the torque itself, by a method `torque`.
 
         Otherwise the simulation kernel, the compiled code of the control loop, contains the
         law.
@@ -122,7 +121,7 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def books_energy(self) -> bool:
-        """True if the law balances the energies that the sites exchange.
+        """True if the law keeps an account of the energy that the arms exchange.
 
         Then all sites must use this law: each site adds up the energy that it sends, and the
         receiving site subtracts what it uses.
@@ -225,7 +224,7 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law acts like passive springs between the positions of the arms.
+        """Returns True if the law couples the arms like passive springs and dampers.
 
         This requires that the law compensates gravity exactly. Stability conditions of laws of
         this kind need reversible dominance factors. The dominance factor alpha_ij is the weight
@@ -235,7 +234,7 @@ class LawSettings(Frozen, frozen=True):
         return False
 
     def target_motion(self, run: TuningRun) -> Array | None:  # noqa: ARG002
-        """Computes the motion that the law promises for the arms, as the goal of its tuning.
+        """Computes how the arms should move with good gains, as the goal of the tuning.
 
         Gains are tuned for arms that move together and rest at the pose to which the operators
         pull them. A law that promises another motion defines this method. Its gains are then
@@ -416,7 +415,7 @@ class ControlLaw:
 
 
 class EnergyLaw(ControlLaw):
-    """Base class of the laws that balance energy between the sites, the processes of the arms.
+    """Base class of the laws that keep an account of the energy that the arms exchange.
 
     One site counts the energy that it sends, and the other site counts the energy that it uses.
     Therefore all sites must use the same law. These laws require the integration scheme

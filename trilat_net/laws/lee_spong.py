@@ -1,12 +1,12 @@
-"""Implements the law of Lee and Spong: PD+d with enough damping for the largest delay.
+"""Implements the law of Lee and Spong, which computes its damping from the largest delay.
 
-PD+d couples an arm by a spring (P) and a damper (D) to its peers, the arms that it follows. A
+The law PD+d couples an arm by a spring (P) and a damper (D) to the arms that it follows. A
 second damper (d) brakes the arm itself. Its damping is computed from the stiffness of the
 spring and the largest delay. Therefore the user states a delay instead of a damping.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.damped_torque`). `LeeSpong.compute_torque` states the same law in plain Python,
-and `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
+The compiled control loop computes this law (`core.control.damped_torque`).
+`LeeSpong.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from collections.abc import Mapping

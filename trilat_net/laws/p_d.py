@@ -20,7 +20,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 
 class PD(ControlLaw):
-    """P+d with known gravity: tau = G(q) - K e - d qd.
+    """Spring to the other arms, damper and known gravity: tau = G(q) - K e - d qd.
 
     The error e is the position less the reference, which is the position of the peers, weighted
     by the dominance factors alpha. For reversible dominance factors, equal gains and one
@@ -87,11 +87,11 @@ class PD(ControlLaw):
         return judge_position_exchange(situation, "K", "d")
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law compensates gravity exactly.
+        """Returns True if the law couples the arms like passive springs and dampers.
 
-        The law then acts like springs and dampers between the positions of the arms. Stability
-        conditions of laws of this kind need reversible dominance factors. The dominance factor
-        alpha_ij is the weight with which site i follows site j. The factors are reversible if
-        positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+        This requires `gravity` = 1, so that the law compensates the gravity torque exactly. The
+        stability condition of the law is proved for this case only, see `condition`. It also
+        needs reversible dominance factors, the weights alpha_ij with which site i follows site
+        j: positive weights D_i must exist with D_i alpha_ij = D_j alpha_ji.
         """
         return self.gravity == 1.0

@@ -20,7 +20,7 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 
 
 class PdD(ControlLaw):
-    """PD+d with known gravity: tau = G(q) - K e - d qd - Kd ed.
+    """Spring and damper to the other arms, known gravity: tau = G(q) - K e - d qd - Kd ed.
 
     G(q) is the gravity torque. The error e is the position less the reference, which is the
     position of the peers, weighted by the dominance factors; ed is its derivative. For constant
@@ -95,11 +95,11 @@ class PdD(ControlLaw):
         return judge_position_exchange(situation, "K", "d")
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law compensates gravity exactly.
+        """Returns True if the law couples the arms like passive springs and dampers.
 
-        The law then acts like springs and dampers between the positions of the arms. Stability
-        conditions of laws of this kind need reversible dominance factors. The dominance factor
-        alpha_ij is the weight with which site i follows site j. The factors are reversible if
-        positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+        This requires `gravity` = 1, so that the law compensates the gravity torque exactly.
+        Stability conditions of laws of this kind need reversible dominance factors, the weights
+        alpha_ij with which site i follows site j: positive weights D_i must exist with D_i
+        alpha_ij = D_j alpha_ji.
         """
         return self.gravity == 1.0

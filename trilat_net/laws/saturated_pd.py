@@ -1,13 +1,14 @@
-"""Implements P+d with a limit on the pull of each peer.
+"""Implements a spring law in which no other arm can pull with more than a largest force.
 
-P+d couples an arm to its peers, the arms that it follows, by a spring (P), and brakes it by a
-damper (d). The spring of P+d would pull strongly towards a peer that is far away. Here the pull
-grows with the distance like a hyperbolic tangent and approaches a largest value.
+The law P+d couples an arm by a spring (P) to the arms that it follows, its peers, and brakes it
+by a damper (d). Such a spring would pull strongly towards a peer that is far away, for example
+after a network failure. Here the pull grows with the distance like a hyperbolic tangent and
+approaches a largest value.
 
 Invariant:
     - No peer pulls with more than alpha_ij P at any distance. P is the largest pull of all
       peers together, a gain of the law, and alpha_ij is the dominance factor, the weight with
-      which site i follows peer j.
+      which site i (the controller of an arm) follows peer j.
 """
 
 from typing import ClassVar
@@ -22,7 +23,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 @compiled
 class SaturatedPd(ControlLaw):
-    """P+d whose pull towards each peer saturates.
+    """Couples arms by springs whose pull is limited at any distance, and brakes each arm.
 
         tau = G - sum_j alpha_ij P tanh(K (q - q_j) / P) - d qd
 

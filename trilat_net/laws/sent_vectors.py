@@ -1,8 +1,8 @@
-"""Reads and checks which vectors a control law sends to its peers.
+"""Reads and checks which numbers a control law sends to other arms, besides the motion.
 
-Each site, a process that runs one arm, sends the motion of its arm to the other sites. Its law
-may send more, for example waves or energies. The class of the law declares these vectors, with
-their names and lengths, in the class variable `sends`.
+Some laws send vectors, for example waves or energies. The class of the law declares their names
+and lengths in the class variable `sends`. The receivers need the declaration to read the
+messages.
 
 Invariant:
     - A declaration is a literal in the source of the law, so reading it runs no user code.

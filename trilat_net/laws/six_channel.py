@@ -1,8 +1,8 @@
 """Implements a control law in which two users share one slave arm by a single factor a.
 
-The factor a is the authority of user 1, and user 2 has the authority 1 - a. It determines the
-dominance factors, the weights with which each arm follows the other two: `complementary_shares`
-gives them all.
+The factor a is the authority of user 1, and user 2 has the authority 1 - a. For a = 0.5, both
+users lead the slave equally. The factor determines the weights with which each arm follows the
+other two, which are called dominance factors: `complementary_shares` computes them.
 
 The torque is computed by the four-channel law, which exchanges positions and forces
 (`FourChannel`). This law adds the check that the weights in a scenario, the description of an
@@ -19,7 +19,7 @@ from .four_channel import FourChannel
 
 
 class SixChannel(FourChannel):
-    """Four-channel law of two users and one slave whose authority is one factor a.
+    """Lets two users share a slave arm by a single factor a, their authority.
 
     The arms exchange positions and forces as in `FourChannel`. The sites, the processes that
     run one arm each, are user 1, user 2 and the slave, in this order. The slave follows user 1

@@ -1,7 +1,8 @@
-"""Implements P+d of a master and a slave with a Smith predictor at the master.
+"""Implements a spring law of a master and a slave with a predictor that removes the delay.
 
 A Smith predictor removes a delay from a control loop: the controller follows a model of the
 remote side that has no delay, and corrects it by the delayed difference from the true motion.
+Here it extends the law P+d, a spring between the arms and a damper at each arm.
 
     slave    tau = G - K (q_s - q_m(t - T)) - d qd_s
              sends w = q_s - x, where the model x is driven by q_m(t - T)

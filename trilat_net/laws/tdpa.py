@@ -687,7 +687,7 @@ def _follow_peers(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Time-domain passivity control: each end observes and limits the energy it takes out.
+    """Couples arms, and limits the energy that each end of a coupling takes out.
 
     A spring K and a damper B move each site towards the integral of the velocities of its peers
     (the arms that it follows), weighted by the dominance factors, and the peers feel the torque

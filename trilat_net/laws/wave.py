@@ -424,7 +424,7 @@ def _find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
 
 @compiled
 class Wave(EnergyLaw):
-    """Couples sites by waves, which carry energy along lines of impedance b between sites.
+    """Couples arms by wave variables, which carry energy along virtual lines between the arms.
 
     At an end without a spring, F = b qd - c v and u = c qd - v with c = sqrt(2 b), where v is
     the received wave and u the sent wave. An end with K and B follows the line by this spring

@@ -1,4 +1,8 @@
-"""Runs code of users, if a person has permitted it: control laws, hands and plants.
+"""Runs code that users wrote, if a person has permitted it.
+
+A scenario, the description of an experiment, may name classes of users: control laws, programs
+that move an arm, and plants (simulations of an arm). A scenario may come from a stranger, so
+its code must not run unasked.
 
 - `imported_code` finds a class by its module and name, and imports it if it is permitted.
 - `code_consent` manages permissions, for scenarios and logs that strangers may have written.
@@ -7,7 +11,7 @@
 
 Invariant:
     - Nothing outside this package imports a module that a scenario or a log names.
-    - Nothing here knows the scenarios: a scenario is something with sites that name code.
+    - Nothing here knows the types of a scenario: any object with sites that name code will do.
 """
 
 from typing import TYPE_CHECKING

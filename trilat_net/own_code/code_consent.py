@@ -1,11 +1,10 @@
-"""Manages permissions for code of users: which laws, operators and plants may run.
+"""Decides which code of users may run, and remembers permissions.
 
-A scenario describes an experiment, and a log contains a recorded run of it. A scenario may name
-classes that users wrote: control laws, operators (programs that move an arm), and plants
-(simulations of an arm). Code that a user names in a scenario of his or her own may run. Code
-that a log, or another member of a session, names may run only if a person names its file,
-because a stranger may have written it. A person may also let the program remember a permission;
-it is then stored in the configuration folder.
+A scenario describes an experiment and may name classes that users wrote: control laws, programs
+that move an arm, and plants (simulations of an arm). Code that users name in their own scenario
+may run. A log, or another member of a session, may come from a stranger. Code that these name
+may run only if a person names its file. The person may let the program remember the permission
+in the configuration folder.
 
 Invariant:
     - The file that a person names must have the hash that the log states, unless the person

@@ -1,9 +1,9 @@
-"""Imports classes that users write: control laws, operators who move an arm, and plants.
+"""Imports classes that users wrote, if a person has permitted it.
 
-A scenario names a class by its module and its name, for example
-`law = "package.module:Law"`. Importing a module runs its code, and a scenario may come from a
-stranger. Therefore code runs only if a person has permitted it before. A permission applies to
-one class in one file, which is identified by its SHA-256 hash.
+A scenario names a class by its module and its name, for example `law = "package.module:Law"`.
+Importing a module runs its code, and a scenario may come from a stranger. Therefore a person
+must permit the code before. A permission applies to one class in one file, which is identified
+by its SHA-256 hash.
 
 Invariant:
     - A scenario contains the hash of the file that defines a class. If a run is repeated from

@@ -1,7 +1,8 @@
-"""Reads which vectors the source of a control law sends, and lays them out for a site.
+"""Finds out which numbers a user's control law sends to other arms, without running the law.
 
-Each site, a process that runs one arm, sends the motion of its arm to the other sites. Its law
-may send more, for example waves or energies. `laws.sent_vectors` has the form of a declaration.
+Each arm sends its motion to the other arms. A law may send further vectors, for example waves
+or energies, which its class declares in `sends` (`laws.sent_vectors`). This module reads the
+declaration from the source code, and computes where each vector is stored in the messages.
 
 Invariant:
     - A declaration is a literal in the source of the law, so reading it runs no user code.

@@ -1,9 +1,10 @@
 """Defines the arms of an experiment: the planar two-link arm, and chains from URDF files.
 
-`Arm` and `Task` are parts of a scenario, the description of an experiment. `build_arm` converts
-them to an `ArmModel` with the geometry and the dynamic parameters that computations need. From
-the model, `compute_rest_gains` derives the damping with which an arm is brought to rest.
-`bound_estimates` derives bounds for the parameters that an adaptive control law estimates.
+`Arm` and `Task` are the tables in which the author of an experiment describes an arm.
+`build_arm` converts them to an `ArmModel` with the geometry and the dynamic parameters that
+computations need. From the model, `compute_rest_gains` derives the damping with which an arm is
+brought to rest, and `bound_estimates` the bounds for the parameters that an adaptive control
+law estimates.
 
 Invariant:
     - If one arm of a scenario is a chain, all arms are modelled as chains. The planar arm is
@@ -84,7 +85,7 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Arm(fields.Frozen, frozen=True):
-    """Table of an arm in a scenario.
+    """Arm of a site, as the author of an experiment describes it in a scenario.
 
     An arm is either the planar arm of two links, or a chain of joints from a URDF file. The
     defaults of the planar arm are those of the paper, with point masses at the ends of the
@@ -171,7 +172,7 @@ CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
-    """Table of a task in a scenario: the coordinates in which the sites follow each other.
+    """Coordinates in which arms follow each other: joint angles, positions or poses.
 
     A site is a process that runs one arm, and its peers are the other sites.
 
@@ -255,7 +256,7 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 class ArmModel(NamedTuple):
-    """Parameters and geometry of an arm with n joints.
+    """Model of an arm with n joints, from which dynamics and kinematics are computed.
 
     `build_arm` creates the model from the table of the arm in a scenario.
 
@@ -425,7 +426,7 @@ class ArmModel(NamedTuple):
 
     @property
     def axes(self) -> tuple[float, ...]:
-        """For each task coordinate, 1 if the site follows its peers along it, and 0 if not.
+        """Directions in which the end effector follows other arms: 1 for followed, 0 for free.
 
         For example (1, 1, 0) for an end effector that follows in x and y, and is free in z.
         Empty if the sites share joint angles.

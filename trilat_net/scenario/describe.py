@@ -1,12 +1,11 @@
 """Describes scenarios in lines of text, and lists the differences between scenarios.
 
-A scenario is the description of an experiment: its arms, their control laws, and the network
-links between the sites, the processes that run the arms. The text includes facts that follow
-from a scenario, for example whether a control law satisfies its condition for stability, and
-how long an arm needs to come to rest.
+A scenario is the description of an experiment with its arms, control laws and network links.
+The text also states facts that follow from a scenario, for example whether a control law
+satisfies its condition for stability, and how long an arm needs to come to rest.
 
 Invariant:
-    - A difference that several sites or links have in common is listed once. If two sites have
+    - A difference that several arms or links have in common is listed once. If two arms have
       control laws of different kinds, the laws are compared as a whole. Links are always
       compared as a whole.
     - Names, titles and expectations only describe an experiment, and are not compared.

@@ -1,9 +1,9 @@
 """Draws numbers of a scenario that are given as probability distributions.
 
-A scenario is a TOML file that describes an experiment. Its author may write
-`{ normal = [mean, deviation] }` or `{ uniform = [low, high] }` in place of a number, for
-example of a start pose, a mass or a gain. The seed, an integer in the scenario, determines the
-numbers that are drawn.
+A scenario is a TOML file that describes an experiment. In place of a number, for example of a
+mass or a gain, its author may write `{ normal = [mean, deviation] }` or `{ uniform = [low,
+high] }`. The seed, an integer in the scenario, determines the numbers that are drawn. Another
+seed gives another random instance of the experiment.
 
 Invariant (L4):
     - A drawn number depends only on the seed and on the place of the number in the scenario,

@@ -1,10 +1,8 @@
-"""Renders an event of a session as a human-readable sentence.
+"""Writes the sentence that describes an event of a session, for example a changed delay.
 
-Logs of older versions are supported too.
-
-An event reports something that happened during a session (a joint run of several arms), for
-example that the delay of a network link was changed. Older versions of the program stored the
-settings of such a change in place of a sentence. This module composes the missing sentence.
+Since old versions of the program stored the settings of a change in place of a sentence, old
+logs would show JSON to people. This module composes the missing sentence, so that old and new
+logs read alike.
 """
 
 from contextlib import suppress

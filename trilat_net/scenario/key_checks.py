@@ -1,8 +1,8 @@
-"""Checks of the values of a scenario's keys, and of the lengths of its vectors.
+"""Checks the keys of a scenario that the types of its tables cannot check.
 
-A scenario is a TOML file that describes an experiment with several robot arms. `fields` has the
-types of its tables. The functions of this module check what these types do not state, for
-example how many numbers a vector needs for the arm of its site.
+A scenario is a TOML file that describes an experiment with several robot arms. The types of its
+tables (`fields`) limit single numbers. The functions of this module check the rest, for example
+that a vector has one number per joint of its arm, and that a key has a known name.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it. For an unknown
@@ -26,7 +26,7 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """How many numbers the vectors of a site have, which depends on its arm.
+    """Lengths of the vectors of a site in a scenario, for example 6 gains for 6 joints.
 
     A scenario may state one number where a vector is needed. The counts say how long the vector
     becomes, and check vectors that are given in full.
@@ -91,7 +91,11 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 @lru_cache(maxsize=256)
 def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """Returns the fields of a table's type. msgspec itself evaluates its types in each call."""
+    """Returns the fields of the type of a scenario's table, for example of `Arm`.
+
+    The result is cached, because `msgspec.structs.fields` evaluates the annotations of the type
+    anew in each call, and a scenario has many tables of the same type.
+    """
     return msgspec.structs.fields(kind)
 
 

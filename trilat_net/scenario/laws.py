@@ -1,7 +1,7 @@
-"""Collects the control laws that a scenario can choose, by name.
+"""Finds the control laws that a scenario can choose, by name.
 
-A control law computes the torques of an arm from its own state and from the delayed states of
-the other arms. A scenario, the description of an experiment, names the law of each arm.
+A scenario, the description of an experiment, names the law of each arm. The law computes the
+torques of the arm from its own state and from the delayed states of the other arms.
 
 Invariant:
     - A law is found by its file in the package `trilat_net.laws`. The class in this file has

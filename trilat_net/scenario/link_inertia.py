@@ -1,10 +1,9 @@
-"""Defines masses and inertias that a scenario states for links, and balances impossible ones.
+"""Replaces the masses and inertias of a robot's bodies by stated or physically possible ones.
 
-A link is here one body of a robot arm, which a URDF file (an XML description of a robot)
-defines with its mass and its inertia. A scenario, the description of an experiment, may state
-other values. Some URDF files contain inertias that no body can have, for example because one
-principal moment exceeds the sum of the other two. Balancing replaces such an inertia by the
-nearest possible one.
+Some URDF files (XML descriptions of robots) contain inertias that no body can have, for example
+because one principal moment exceeds the sum of the other two. The author of an experiment can
+state other values in the scenario, or let the program balance the inertia, which replaces it by
+the nearest possible one. A link is here one body of a robot arm.
 
 Invariant:
     - A key in the scenario replaces the value in the file. Without the key, the file applies.

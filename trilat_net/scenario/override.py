@@ -1,8 +1,8 @@
-"""Applies overrides KEY=VALUE, which change single keys of a scenario.
+"""Changes single keys of a scenario by overrides such as `control.Kd=5`.
 
-A scenario is a TOML file that describes an experiment: its sites, the processes that run one
-arm each, and the network links between them. Overrides change the tables of such a file, or a
-resolved scenario, in which every key of every site and link is written out.
+A scenario is a TOML file that describes an experiment. Overrides change the tables of such a
+file, or a resolved scenario, in which every key of every site (the control process of an arm)
+and of every network link is written out.
 
 Invariant:
     - In a resolved scenario, a key without the name of a site or link (`control.Kd`,
@@ -38,7 +38,7 @@ Override = tuple[str, Any]
 
 
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Replaces each override of a whole group by overrides for its single members.
+    """Replaces an override for all sites or links by one override for each of them.
 
     An override replaces one value of a scenario, the description of an experiment. Groups are
     all sites (the processes of the arms) or all links (the connections between them). For

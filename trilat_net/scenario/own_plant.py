@@ -1,7 +1,7 @@
-"""Reads the table of a user's plant: a class that computes the motion of an arm and of bodies.
+"""Reads the part of a scenario that names a user's simulation of an arm, called a plant.
 
-A plant takes the place of the built-in simulation of an arm. In a scenario, the description of
-an experiment, the plant of an arm is named by its class:
+A plant is a class that computes the motion of an arm and of other bodies, in place of the
+built-in simulation. The author of an experiment names the class:
 
     plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2 }
 

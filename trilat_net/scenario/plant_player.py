@@ -1,7 +1,8 @@
-"""Runs a user's plant: a class that computes the motion of an arm and of other bodies.
+"""Runs a user's simulation of an arm and of other bodies, called a plant.
 
-A plant takes the place of the built-in simulation of an arm. At each tick, a period of the
-control loop, it receives the torque of the control law and returns the new state of the arm.
+A plant, for example a physics engine with objects to grasp, takes the place of the built-in
+simulation. In each control period, it receives the torque of the control law and returns the
+new state of the arm.
 
 Invariant:
     - The state that a plant returns is treated as a measurement, like the state of a real

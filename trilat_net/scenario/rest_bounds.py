@@ -1,10 +1,9 @@
-"""Bounds the motion of an arm that stops: the time until it rests, and its speeds.
+"""Computes in advance how long an arm takes to stop, and how fast its joints may become.
 
-When a site, the process that runs one arm, must stop, its controller brakes the joints until
-they rest. Each joint is damped in proportion to its speed, within the limits of the torques
-(`core.resting`). From the model of the arm and these limits, this module computes in advance
-how long this takes, how fast the joints may become, and whether the motors are strong enough
-for the arm's gravity and Coriolis torques.
+An arm must stop if, for example, the network fails. Its controller then damps each joint in
+proportion to its speed, within the limits of the torques (`core.resting`). From the model of
+the arm and these limits, this module computes bounds of the time and of the speeds. It also
+tells whether the motors are strong enough for the arm's gravity and Coriolis torques.
 
 The formulas are derived in docs/theory/coming-to-rest.md, and the numbers of equations in
 comments refer to it.

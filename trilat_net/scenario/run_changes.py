@@ -1,12 +1,9 @@
-"""Checks and describes changes of a running experiment.
+"""Checks and describes changes of a running experiment, such as a new delay or a stop.
 
-Three things can change: a link, the weights with which a site follows other sites (dominance
-factors), and the state of a site. A site is the process that runs one arm, and a link is the
-one-way network connection between two sites. Commands such as stop, enable and reset change the
-state of a site.
-
-Changes are planned in a scenario, the description of the experiment, or requested during the
-run.
+Three things can change: a network link between two arms, the weights with which an arm follows
+the others (dominance factors), and the mode of an arm, by commands such as stop, enable and
+reset. Changes are planned in a scenario, the description of the experiment, or requested during
+the run.
 
 Invariant:
     - A request may state only the settings that change. They are completed with the settings

@@ -1,9 +1,9 @@
-"""Predicts which messages of the other arms a controller uses and a user sees.
+"""Computes which messages of the other arms a controller used and a user saw, without the run.
 
-In each control period, a site (the process that runs one arm) sends the state of its arm to the
-other sites. These messages are delayed and lost at random. The random numbers follow from a
-seed in the scenario, the description of the experiment, so they can be drawn again without a
-run. For example, a report can show what a user saw although the log does not contain it.
+In each control period, an arm sends its state to the other arms. These messages are delayed and
+lost at random, but the random numbers follow from a seed in the scenario, the description of
+the experiment. They can therefore be drawn again. For example, a report can show what a user
+saw although the log does not contain it.
 
 Invariant:
     - The random numbers of a connection are the same as in a run.

@@ -1,8 +1,7 @@
-"""Loads scenarios from files, texts, tables or logs, and applies overrides of their keys.
+"""Loads scenarios, the descriptions of experiments, from files, texts, tables or logs.
 
-A scenario is a TOML file that describes an experiment with several sites, processes that run
-one arm each. A log contains the scenario of its run. An override changes single keys of a
-scenario without editing the file, for example `control.Kd=5`.
+A scenario is written as a TOML file, and a log contains the scenario of its run. While loading,
+overrides such as `control.Kd=5` change single keys without editing the file.
 
 Invariant:
     - The scenario of a log or of another member of a session is not trusted. It may not name a

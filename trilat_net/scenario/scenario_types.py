@@ -1,9 +1,9 @@
-"""Defines the types of a complete scenario: sites, limits, planned changes, and the whole.
+"""Defines the types of a complete scenario: the whole, its arms, limits and planned changes.
 
-A scenario describes an experiment: a site is a process that runs one arm and its control loop,
-and each pair of sites is connected by two directed links. The types also translate a scenario
-into the setup from which the simulation kernel, the compiled control and simulation code,
-builds a site (`Scenario.setup`).
+A scenario describes an experiment. Each arm is controlled by a process called a site, and each
+pair of sites is connected by two directed links. `Scenario.setup` translates a scenario into
+the numbers from which the simulation kernel, the compiled control and simulation code, builds a
+site.
 
 Invariant:
     - The name of a key ends in its unit. Symbols are those of the paper on which the project is

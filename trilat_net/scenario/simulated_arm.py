@@ -1,7 +1,8 @@
-"""Simulates an arm of a scenario step by step, for programs that stand in for a robot or plant.
+"""Simulates an arm step by step, for programs that stand in for a robot.
 
-A scenario describes an experiment, including the mass and the geometry of each arm. The
-simulation computes joint accelerations from torques and integrates them over time.
+For example, a test of a robot driver can use `SimulatedArm` instead of the robot. It computes
+the joint accelerations from torques and integrates them over time, with the masses and the
+geometry that a scenario (the description of an experiment) states.
 
 Invariant:
     - The arm obeys the equation of motion that the scenario's arm obeys in a run, Eq. (8) of

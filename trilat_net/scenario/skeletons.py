@@ -1,4 +1,7 @@
-"""Writes skeletons of code for users: a working law, operator or plant, and a test of it.
+"""Writes files from which users start their own control law, operator or plant.
+
+`new_law`, `new_hand` and `new_plant` write a class with a simple content, and a test of it. The
+user then edits code that works instead of starting from an empty file.
 
 Invariant:
     - The skeletons are files of this package, such as `scenarios/_law.txt`. The class gets its

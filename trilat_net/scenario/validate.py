@@ -1,10 +1,11 @@
-"""Converts the resolved tables of a scenario to types, and refuses values that cannot work.
+"""Refuses scenarios that cannot work, and converts all others to types.
 
-`build_scenario` converts the tables. The types themselves limit the range of each single key;
-the functions of this module check conditions that involve several keys, for example that a
-joint starts within its stops. `refuse_external_arms`, `refuse_live_only` and
-`check_outside_arms` are for callers that need more than a valid scenario: a run in virtual
-time, or a live session with real robots.
+A scenario is the description of an experiment. The types of its tables limit each single key.
+The functions of this module check conditions that involve several keys, for example that a
+joint starts within its stops. `build_scenario` does both.
+
+`refuse_external_arms`, `refuse_live_only` and `check_outside_arms` are for callers that need
+more than a valid scenario: a run in virtual time, or a live session with real robots.
 
 Invariant:
     - An error contains the path of the key in the scenario file.

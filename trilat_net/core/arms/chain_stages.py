@@ -1,8 +1,9 @@
-"""Computes those stages of a tick that depend on the arm, for a chain of n joints.
+"""Computes the parts of a control period that depend on the arm, for an arm of n joints.
 
-A tick is one period of the control loop, and a stage is one of the eight steps in which
-`kernel` computes a tick. The dynamics of the arm are computed by recursions from joint to
-joint. The argument `chain` holds one row of numbers per joint, described in `chain_dtype`.
+`kernel` computes a control period (tick) in eight stages. Some of them, such as the torque of
+the control law, need the dynamics of the arm. For an arm that is a chain of joints, this module
+computes these stages by recursions from joint to joint. The argument `chain` holds one row of
+numbers per joint, described in `chain_dtype`.
 
 Invariant:
     - `two_link_stages` has the same functions for the planar two-link arm, and `kernel` calls

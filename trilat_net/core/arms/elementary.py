@@ -1,7 +1,8 @@
 """Computes sine, cosine and hyperbolic tangent with the same bits on every machine.
 
-The platform's own functions differ in the last bit from one C library to the next, and a replay
-must not.
+The functions of the C library differ in the last bit from one platform to the next. A run that
+is executed again from its log on another machine would then differ, too. The functions of this
+module do not.
 
 - The angle is reduced by multiples of pi/2, which is stored in three parts (Cody and Waite,
   "Software Manual for the Elementary Functions", 1980).

@@ -1,8 +1,8 @@
-"""Computes the torques by which operators and environments act on an arm.
+"""Computes the torques that operators and environments exert on an arm.
 
-An operator is a person or a program that moves the arm. An environment is, for example, a wall
-that the arm touches. Both are called actors in the code, because their torque is computed in
-the same way.
+An operator is a human or a program that moves the arm, for example a model of a human hand. An
+environment is, for example, a wall that the arm touches. The code calls both of them actors,
+because their torque is computed in the same way.
 
 Sign: This module computes the torque ON the arm. Records and the equations of the control laws
 use tau_x, the negative of this torque. The total torque of the joints is tau - tau_x, where tau

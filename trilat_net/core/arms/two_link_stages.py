@@ -1,8 +1,9 @@
-"""Computes those stages of a tick that depend on the arm, for the planar two-link arm.
+"""Computes the parts of a control period that depend on the arm, for the planar two-link arm.
 
-A tick is one period of the control loop, and a stage is one of the eight steps in which
-`kernel` computes a tick. The loops over the two joints are written out, so that the compiled
-code keeps the numbers in registers.
+`kernel` computes a control period (tick) in eight stages. Some of them, such as the torque of
+the control law, need the dynamics of the arm. This module contains these stages for two joints.
+The equations of the two joints are written one below the other, without loops, so that the
+compiled code keeps the numbers in registers.
 
 Invariant:
     - `chain_stages` has the same functions for a chain of n joints. They have one more

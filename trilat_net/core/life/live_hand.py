@@ -1,8 +1,9 @@
-"""Computes how a person or program pulls an arm, from its messages during a run.
+"""Computes how a human or a program pulls an arm, from messages that arrive during a run.
 
-A person or program that moves an arm during the run is called a live hand. Its messages contain
-goals. A target moves towards the newest goal, and a simulated spring pulls the arm to the
-target. The force of the spring is multiplied by the grip, a number from 0 to 1.
+A person who drags an arm on a web page, or a program with a haptic device, sends messages with
+goals. Such an operator is called a live hand. A target moves towards the newest goal, and a
+simulated spring pulls the arm to the target. The force of the spring is multiplied by the grip,
+a number from 0 to 1.
 
 Rules:
 
@@ -131,7 +132,7 @@ class HandRules(NamedTuple):
 
 
 class HandCommand(NamedTuple):
-    """Message by which a person or program moves an arm during the run.
+    """Message by which a human or program moves an arm during the run.
 
     Attributes:
         source: Identifies the sender, a random number above 0.
@@ -151,7 +152,7 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """State of a live hand, a person or program that moves an arm, between two control periods.
+    """State of a human or program that moves an arm, as stored between two control periods.
 
     Attributes:
         source: Sender that holds the arm; 0: nobody, though a grip may still fade.
@@ -180,7 +181,7 @@ class HandMemory(NamedTuple):
 
 
 class HandInForce(NamedTuple):
-    """What a live hand, a person or program that moves an arm, does in one tick.
+    """How a human or program pulls an arm in one control period, as a record contains it.
 
     A tick is a control period. The fields are in the order of the field `hand` of its record.
 
@@ -218,7 +219,7 @@ class HandInForce(NamedTuple):
 
 
 class HandStep(NamedTuple):
-    """What a person or program does with an arm in one control period.
+    """Result of one control period for the human or program that moves an arm.
 
     Attributes:
         memory: State for the next period.

@@ -1,12 +1,13 @@
-"""Runs a user's hand program, which acts as the operator of an arm.
+"""Lets a user's program move an arm, as a human operator would.
 
-The program decides at a fixed rate. For each decision it receives a view of what its site, the
-process that runs the arm, knows in a tick (period of the control loop). It returns a target for
-the arm or a force on it.
+The program is a class with a method `act`. At a fixed rate it receives a `HandView`: what the
+control process of the arm knows at that time, such as joint angles and forces. It returns a
+target towards which the arm is pulled, or a force on the arm. A learned policy or a model of a
+human can thus operate a master arm.
 
 Invariant:
-    - A decision that is based on tick k acts a fixed time after tick k, wherever the program
-      runs. A decision that arrives later than this acts at once.
+    - A decision that is based on tick k (a period of the control loop) acts a fixed time after
+      tick k, wherever the program runs. A decision that arrives later than this acts at once.
     - The action is an input of the tick and is stored with it, so a log repeats the action
       without the program.
 """
@@ -39,7 +40,7 @@ PROGRAM = 1
 
 
 class HandContext(NamedTuple):
-    """Facts that a hand program receives before the run.
+    """Facts about the arm that a user's program receives before it moves the arm.
 
     >>> class Still:
     ...     def __init__(self, facts: tn.HandContext) -> None:
@@ -72,7 +73,7 @@ class HandContext(NamedTuple):
 
 
 class HandView(NamedTuple):
-    """The knowledge of a site at a tick, as its hand program sees it.
+    """What a user's program that moves an arm may know when it makes a decision.
 
     >>> def act(self, now: tn.HandView) -> list[float]:
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
@@ -107,7 +108,7 @@ class HandView(NamedTuple):
 
 
 class HandProgram(Protocol):
-    """Interface of a program, written by a user, that moves an arm as an operator would.
+    """Interface of a user's program that moves an arm as a human operator would.
 
     The class of the program is called with two kinds of arguments: a `HandContext`, and the
     settings of the program as keyword arguments.

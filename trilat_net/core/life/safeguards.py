@@ -1,13 +1,15 @@
-"""Limits the speed of a site's reference, and blends its torque after a rest.
+"""Limits the speed of the position that an arm follows, and avoids a jump of the torque.
 
-A site is a process that runs one arm. The reference is the position that its control law aims
-at. When an arm leaves its rest, the torque changes gradually from the torque that holds the arm
-to the torque of the law.
+A network fault or a sudden motion of another arm must not make an arm jump.
+
+- `limit_reference` limits the speed of the reference, the position at which the control law
+  aims.
+- `return_to_law` is used when an arm begins to move after a rest. It changes the torque
+  gradually from the torque that held the arm to the torque of the control law.
 
 Invariant:
 
-- The reference moves no faster than its speed limit, whatever the peers (the sites that it
-  follows) do.
+- The reference moves no faster than its speed limit, whatever the other arms do.
 - A reference without a speed limit is not changed.
 """
 

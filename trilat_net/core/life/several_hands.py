@@ -1,11 +1,13 @@
-"""Computes how programs move the planar arms of several runs side by side.
+"""Computes how programs move the planar arms of several simulated runs at once.
 
-In each run one program decides at a fixed rate where it pulls the arm of its site, as an
-`OwnHand` does. Here the decisions come from outside, an array for all runs.
+A program may act as the operator of an arm, for example a policy in training. It decides at a
+fixed rate where it pulls the arm. `OwnHand` computes the motion for one run. This module
+computes it for all runs of a training environment in one call, with the decisions of all
+programs as one array, so that no Python code runs for a single run.
 
 Invariant:
-    - The actions are those of `OwnHand.advance_span`, bit for bit, as long as the program
-      decides in time, see `explain_hand`.
+    - The results are those of `OwnHand.advance_span`, bit for bit, if each program decides in
+      time. `SeveralHands.explain` names the programs that this module cannot compute.
 """
 
 import math
@@ -25,7 +27,9 @@ ACTION_NUMBERS = 1 + 2 * AXES
 
 
 class HandArrays(NamedTuple):
-    """State and limits of the programs' hands in L runs, see `HandMemory` and `HandRules`.
+    """How programs pull the arms in L runs: the state and the limits of each pull.
+
+    See `HandMemory` and `HandRules` for the same quantities of a single run.
 
     Attributes:
         holds: 1 if the program holds the arm, shape (L,).
@@ -61,7 +65,7 @@ class HandArrays(NamedTuple):
 
 @leaf
 def _put_nearest_goal(lane: int, goal: Array, hands: HandArrays) -> None:
-    """Writes the goal of a lane, moved into the reachable region, see `HandReach.find_nearest`.
+    """Moves the goal of a program to the nearest point that its arm can reach.
 
     Args:
         lane: The lane.
@@ -104,7 +108,7 @@ def _advance_hands(
     rows: Array,
     actions: Array,
 ) -> None:
-    """Computes the actions of the programs in a span of ticks, which a decision may begin.
+    """Computes how each program pulls its arm in the next ticks, from its decisions.
 
     Args:
         runs: Number of runs.
@@ -168,7 +172,7 @@ def _advance_hands(
 
 
 class SeveralHands:
-    """Hands of programs in several runs, one in each.
+    """Computes how programs pull the arms in several runs, one program in each run.
 
     Args:
         count: Number L of runs.
@@ -217,7 +221,7 @@ class SeveralHands:
 
     @staticmethod
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Explains why the hand of a program cannot be computed here.
+        """Returns why the actions of a program cannot be computed for several runs at once.
 
         Args:
             rules: Its limits.
@@ -236,7 +240,7 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Lets the hand of a run begin: it does not hold the arm.
+        """Prepares a new run, in which the program does not hold the arm yet.
 
         Args:
             run: Index of the run.
@@ -268,7 +272,7 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes the actions of a span of ticks, which a decision may begin.
+        """Computes how each program pulls its arm in the next ticks, from its decisions.
 
         Args:
             runs: Number of runs that are advanced, the first ones.

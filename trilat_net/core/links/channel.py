@@ -1,8 +1,9 @@
-"""Computes when a simulated network delivers each sample, or that it loses the sample.
+"""Computes when a simulated network delivers each message, or that it loses the message.
 
-A link is the directed connection between two sites, the processes that run one arm each. A
-sample is the state that a site sends in one tick (period of its control loop), and its stamp is
-the number of this tick. A link delays each sample, and may lose or duplicate it.
+In each control period, an arm sends its state, a sample, over a link to each other arm. The
+number of the period is called the stamp of the sample. The model of a link may delay, lose or
+duplicate samples, for example with losses in bursts. `schedule_deliveries` computes the fate of
+all samples up to a given one.
 
 Invariant (law L4 of docs/develop/design.md):
 
@@ -60,13 +61,13 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
 @leaf
 def loses_samples(model: Row) -> bool:
-    """Returns True if a model may lose samples at random, so that its losses are drawn."""
+    """Returns True if a network model may lose samples at random."""
     return bool(model.loss_good != 0.0 or model.enter != 0.0)
 
 
 @leaf
 def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Advances the chain of losses by one sample, and returns True if the sample is lost.
+    """Decides by random numbers whether the next sample is lost, with losses in bursts.
 
     The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
     loss. A fresh chain starts in its stationary distribution, where the bad state has the
@@ -92,7 +93,7 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Draws whether a sample is lost, and returns True if it is.
+    """Returns True if a sample is lost, as random numbers decide.
 
     Args:
         sample: Index of the sample.

@@ -1,10 +1,9 @@
-"""Computes by how much a simulated network delays each sample.
+"""Computes the delay of each message in a simulated network.
 
-Two sites, the processes that run one arm each, are connected by a link in each direction. In
-each period of its control loop, a site sends a sample with the state of its arm. The periods
-are numbered, and this number is the index of the sample. The stamp of the sample is the time at
-which it was sent. A delay model is a distribution of delays, a function of time, or a recorded
-trace.
+A delay model is a distribution of delays, a function of time, or a recorded trace. The messages
+are samples: in each control period, an arm sends a sample with its state over a link to each
+other arm. The index of a sample is the number of this period, and its stamp the time at which
+it was sent.
 
 Invariant (law L4 of docs/develop/design.md):
     - A delay depends only on the seed of the link and on the index and the stamp of the sample.
@@ -63,7 +62,7 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """What a trace, a table of delays by time, does after its last point.
+    """How a trace, a table of delays by time, continues after its last point.
 
     It holds the last delay, or starts again.
     """
@@ -73,7 +72,7 @@ class TraceEnd(IntEnum):
 
 
 class LinkModel(NamedTuple):
-    """Effect of a link on its samples, from a stamp on until the next model applies.
+    """Network model of a link, its delay and its losses, for samples sent from a time on.
 
     The stamp of a sample is the time at which it was sent.
 

@@ -1,8 +1,9 @@
-"""Computes the weights with which arms follow each other, and the reference of an arm.
+"""Computes the position that an arm follows: a weighted mean of the positions of other arms.
 
-A site is a process that runs one arm. Site i follows site j with the weight alpha_ij, which is
-called dominance factor or share. The reference of site i, the position that its control law
-aims at, is the sum of alpha_ij q_j, where q_j is the position of arm j.
+Each arm is controlled by a process called a site. Site i follows site j with the weight
+alpha_ij, which is called dominance factor or share. If two users with the factors 0.7 and 0.3
+lead a slave, the slave follows 0.7 q_1 + 0.3 q_2, where q_j is the position of arm j. This sum
+is called the reference of the slave.
 
 In the stability proof, the matrix Upsilon = I - alpha describes the coupling, with the identity
 I. The energy function of the proof weights site i with the number beta_i.

@@ -1,15 +1,14 @@
-"""Simulates the delay of a network link, at its receiving end.
+"""Holds each received message until the delay of the simulated network has passed.
 
-A site is a process that runs one arm, and a link is the one-way connection from one site to
-another. In each tick, a period of its control loop, a site sends a sample, which is the state
-of its arm. The sample carries the number of the tick, which is called its stamp. The receiver
-keeps each sample until its simulated delivery time, which is called the due time.
+In each control period (tick), an arm sends a sample, its state, to each other arm. A real
+network may be faster than the network that an experiment emulates. Therefore the receiver keeps
+a sample until its due time: the time at which it was sent, plus the simulated delay.
 
-Samples wait in a ring buffer, which is called the calendar of the link. It has a page for each
-of the next ticks of the receiver. `accept_sample` writes a sample into the page of the tick
-that will use it, unless this page holds a newer sample. `release_sample` reads the page of the
-present tick. Both take the same time for any delay. Due times are kept longer than samples, for
-as long as a late sample or a duplicate may arrive.
+The samples wait in a ring buffer with one page for each of the next ticks of the receiver,
+called the calendar. `accept_sample` writes a sample into the page of the tick that will use it,
+unless this page holds a newer sample. `release_sample` reads the page of the present tick. Both
+take the same time for any delay. Due times are kept longer than samples, for as long as a late
+sample or a duplicate may arrive.
 
 Invariant (law L2 of docs/develop/design.md):
     - The due time of a sample is an integer in ns. It follows from the time at which the sample
@@ -59,7 +58,7 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that another control law sends, in the order in which this law reads them.
+    """Numbers that the control law of another arm sends, in the order of their use here.
 
     C is the count of these numbers. If the arrays are for several peers (the processes of other
     arms) or for several sites (the receivers), they have additional first axes.
@@ -116,7 +115,7 @@ this, and LOST is above it.
 
 
 def span_ticks(span_ns: int, rate_hz: int) -> int:
-    """Returns the number of ticks that span a time, rounded up.
+    """Returns how many ticks (control periods) a time takes, rounded up.
 
     The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
 
@@ -207,7 +206,7 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Files the numbers that the law of a peer sent with a sample in a page of the calendar.
+    """Stores the numbers that a peer's control law sent with a sample, until its use.
 
     A peer is the site at the sending end of the link. The numbers wait together with the sample
     until its delay has passed.
@@ -226,7 +225,7 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Brings the numbers that a peer's law sent with a released sample into use.
+    """Passes the numbers that a peer's law sent with a sample to this law.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.

@@ -1,12 +1,13 @@
-"""Lets an arm continue without a lost peer, whose weight the other peers get.
+"""Lets an arm continue when another arm that it follows is lost.
 
-A site is a process that runs one arm. Its peers are the other sites, from which it receives
-samples (states of their arms). A site follows each peer with a certain weight, the dominance
-factor or share. A peer is lost if no sample of it could be used for some time.
+An arm follows several other arms, its peers, each with a certain weight (dominance factor). A
+peer is lost if no sample (received state) of it could be used for some time. The remaining
+peers then get its weight: a slave that followed two users with 0.7 and 0.3 follows the second
+user alone if the first one is lost.
 
 Invariant:
-    - All decisions follow from the samples in use and from the stored state of the site. They
-      are made in each tick, a period of the control loop.
+    - All decisions follow from the samples in use and from the stored state of the site, the
+      process that controls the arm. They are made in each period of the control loop.
     - A site only continues without a peer if the remaining sites all reach each other without
       it, and if the site still follows another peer. Otherwise the arm stops.
     - The reference, the position that the arm follows, never jumps. It moves smoothly to the
@@ -198,7 +199,7 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Adapts the dominance factors of a site to peers that are lost or have returned.
+    """Gives the weight of lost peers to the other peers, and returns it when they come back.
 
     A site is the process that runs one arm, and its peers are the other sites. A dominance
     factor is the weight with which the site follows a peer. The factors of lost peers are

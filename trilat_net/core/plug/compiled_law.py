@@ -156,7 +156,7 @@ def law_stage(
 
 
 class LawForm(NamedTuple):
-    """Layouts for which a law is compiled. Laws with equal forms share the compiled code.
+    """Data types for which a control law is compiled. Laws with equal types share the code.
 
     Attributes:
         law: Layout of the law's numbers.
@@ -199,7 +199,7 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 # Numba cannot return a record from a function, so the code becomes a part of each caller.
 @numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
 def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
-    """Returns the input of a control law in a tick. Nothing is copied.
+    """Returns the input of a control law in a tick, as views of the arrays, without copying.
 
     Args:
         s: Row of the site.

@@ -1,10 +1,10 @@
-"""Describes the numbers that a control law sends to other arms besides the motion.
+"""Defines where the numbers that a control law sends to other arms are stored in a record.
 
-A site is a process that runs one arm, and its peers are the other sites. Some control laws send
-vectors of numbers to their peers, for example wave variables or energies. A vector either goes
-to all peers, or each peer gets a vector of its own.
+Each arm sends its motion to the other arms, its peers. Some control laws send further vectors,
+for example wave variables or energies. A vector either goes to all peers, or each peer gets a
+vector of its own.
 
-In each tick, a period of the control loop, the site stores all numbers that its law sends in
+In each control period, the site (the process that controls an arm) stores all these numbers in
 the field `ch` of its record. A peer receives the part that is meant for it. Therefore the
 records of the sender show what each peer received.
 
@@ -26,7 +26,7 @@ MAX_RECORD_SENT = 1024
 
 
 class SentVector(NamedTuple):
-    """Vector that a law sends at every tick.
+    """Vector that a control law sends to other arms at every tick, for example energies.
 
     Attributes:
         name: Name of the vector, as the law uses it.
@@ -177,7 +177,7 @@ class LawChannel(NamedTuple):
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns all vectors that a law may receive from its peers, each name once.
+    """Returns all vectors that a law may receive from the other arms; equal names appear once.
 
     Args:
         channels: Vectors that the laws of the peers send.

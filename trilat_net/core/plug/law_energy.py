@@ -1,10 +1,9 @@
-"""Describes the energies with which a control law proves that it is passive.
+"""Defines the account of energy by which a control law shows that it never produces energy.
 
-A control law is passive if it never gives more energy than it received. Some laws keep an
-account of their energy: the energy that they sent to other arms, took from other arms, stored
-and dissipated. Such a law has a method that computes this account from the records of a run,
-which contain the numbers of each period of the control loop. After the run, a check compares
-the account with the motion of the arms.
+Such a law is called passive: a delay in the network cannot feed energy into the arms. Some laws
+count the energy that they sent to other arms, took from other arms, stored and dissipated. They
+have a method that computes this account from the records of a run, which contain the numbers of
+each control period. A check then compares the account with the motion of the arms.
 
 Invariant:
     - The energy that arm i takes from arm j is never more than the energy that the law of arm j
@@ -41,7 +40,7 @@ class PeerRecords(NamedTuple):
 
 
 class LawRecords(NamedTuple):
-    """Records of the site of a law: K ticks, one row per tick.
+    """Recorded motion, torques and messages of a site in K ticks, for energy accounts.
 
     Attributes:
         h_s: The period, s.
@@ -65,7 +64,9 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Energies of a law in K ticks, J, shape (K,) or (K, parts) each.
+    """Account of the energy that a control law gave, took, stored and dissipated in K ticks.
+
+    All energies are in J and have the shape (K,) or (K, parts).
 
     Flows are sums since the beginning. Each part, for instance that of a joint, must not be
     below zero by itself.

@@ -1,13 +1,12 @@
-"""Gives a control law its input in each tick: the motion of its arm and of its peers.
+"""Gives a control law its input in each period: the motion of its arm and of the other arms.
 
-A tick is one period of the control loop. The state of a site, the process that runs an arm, is
-stored in rows of arrays, which the compiled stages of a tick read and write. A compiled law
-reads the rows directly. For a law in plain Python, this module copies the rows to lists and
-writes the results back.
+The compiled code of a control period stores the state of an arm in rows of arrays. A compiled
+control law reads these rows directly. For a law in plain Python, this module copies the rows to
+lists and writes the results of the law back.
 
 Invariant:
     - The compiled and the plain form of a law see the same numbers.
-    - A vector that the law sends to its peers keeps its numbers until the law writes it again.
+    - A vector that the law sends to other arms keeps its numbers until the law writes it again.
 """
 
 from collections.abc import Sequence

@@ -110,7 +110,7 @@ call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
-    """Computes a hash of all source files in the folder of a function.
+    """Returns a hash of all source files in the folder of a function.
 
     Compiled code is stored on disk under this hash. After a change of a source file, the hash
     is different, and the function is compiled again.

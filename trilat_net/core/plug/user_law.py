@@ -1,13 +1,14 @@
-"""Calls a user's control law in plain Python: its input, its results and its memory.
+"""Calls a user's control law in plain Python, once per period of the control loop.
 
-A control law is a class with a method `torque`, which computes the torque of an arm in each
-tick (period) of the control loop. Between ticks a law may keep numbers, its memory.
+A control law is a class with a method `torque`, which computes the torque of an arm from a
+`LawInput`: the motion of the arm and of the other arms. From period to period a law may keep
+numbers, its memory, for example an integral of the error.
 
 Invariant:
     - A law is a function of its input and its memory: equal inputs and an equal memory give
       equal torques.
-    - The record of each tick, its stored result, contains the memory. A run can therefore be
-      resumed from the middle of its log.
+    - The record of each period contains the memory. A run can therefore be resumed from the
+      middle of its log.
 """
 
 import math
@@ -24,7 +25,7 @@ from ..step.vectors import Vector
 
 
 class LawContext(NamedTuple):
-    """Facts that a law receives before the run.
+    """Facts about the arm and its peers that a control law receives when it is created.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
@@ -91,7 +92,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """List of numbers with arithmetic, in which a law in plain Python receives its vectors.
+    """List of numbers with arithmetic, so that users can write control laws as formulas.
 
     Operations act number by number, as in `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`. The
     other operand is a number, or a list with as many numbers.
@@ -108,7 +109,10 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """Peer as a law sees it in a tick: its sample in use, or its start pose at rest.
+    """What a control law knows about another arm (a peer) in a tick.
+
+    This is the newest sample of the peer that the law may use, or the peer's start pose at rest
+    before the first sample.
 
     A sample is the state that a peer published in one of its ticks.
 
@@ -133,7 +137,7 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """Input of a law in a tick, and the places for its results.
+    """Input of a control law in one control period (tick), and the places for its results.
 
     A vector has one number per joint, or one per coordinate that the sites share.
 
@@ -234,7 +238,7 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 def call_law(
     law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
 ) -> "LawResults":
-    """Calls a law in a tick and returns its results.
+    """Calls a user's control law for one control period, and checks its results.
 
     Args:
         law: The law.
@@ -272,7 +276,7 @@ def call_law(
 
 
 class LawResults(NamedTuple):
-    """Results of a user's law in one tick, as `call_law` returns them.
+    """Results of a user's control law in one control period, as `call_law` returns them.
 
     They are the torque of each joint, the estimate of the arm's parameters, the memory that the
     law keeps for the next tick, and the numbers that it sends to its peers.

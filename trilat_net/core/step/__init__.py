@@ -1,1 +1,6 @@
-"""One tick of a site in eight stages, the arrays of all sites, and the fused run."""
+"""Computes one control period of an arm in eight stages, and whole simulations of all arms.
+
+`Site.step` in `site_step` computes one period for any driver: a live session, a simulation or
+the verification of a log. `fused_run` simulates all arms in one compiled call, for studies of
+many runs. `row_fields` defines the arrays in which the state of an arm is stored.
+"""

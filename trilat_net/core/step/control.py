@@ -1,14 +1,14 @@
 """Computes the joint torques of the built-in control laws for the planar two-link arm.
 
 There are two kinds of law. The adaptive law estimates the dynamic parameters of its arm, such
-as masses, with the regressor of the arm. The regressor is the matrix whose product with the
-parameters is the torque of the arm's dynamics. The other laws know the gravity torque of the
-arm and compensate it. They add damping (P+d), damping and a derivative term (PD+d), or the
-force that a remote arm feels. `chain_stages` has the same laws for chains of joints.
+as masses, while it controls the arm. The other laws know the gravity torque of the arm and
+compensate it. They add damping (P+d), damping and a derivative term (PD+d), or the force that a
+remote arm feels. `chain_stages` has the same laws for chains of joints.
 
 Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; the
 convergence rate Lambda in 1/s) or per dynamic parameter. Angles are in rad, speeds in rad/s,
-torques in N m.
+torques in N m. The regressor is the matrix whose product with the dynamic parameters is the
+torque of the arm's dynamics.
 
 Invariant:
     - The errors and the regressor are computed before the estimate is updated, and do not

@@ -1,13 +1,12 @@
 """Computes a fingerprint of the platform's arithmetic, to tell where runs repeat exactly.
 
-Simulations are reproducible to the last bit only on platforms with equal arithmetic. The
-fingerprint is a hash of the results of a fixed computation. This computation consists of many
-sines and cosines, and of a short simulation of two arms that follow each other over a network
-with random delays.
+Results of the same program can differ in the last bit between platforms. A log of a run
+contains the fingerprint of the platform that wrote it. When a log is verified, the run is
+computed again. The results must be equal to the last bit only if the fingerprint of the present
+platform is the same (law L5 of docs/develop/design.md).
 
-A log of a run contains the fingerprint of the platform that wrote it. When a log is verified,
-the run is computed again. The results must be equal to the last bit only if the fingerprint of
-the present platform is the same (law L5 of docs/develop/design.md).
+The fingerprint is a hash of the results of a fixed computation: many sines and cosines, and a
+short simulation of two arms that follow each other over a network with random delays.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
-"""Simulates all sites of an experiment in one compiled call, for studies of many runs.
+"""Simulates all arms of an experiment in one compiled call, for studies of many runs.
 
-A site is an arm with its control loop. The run takes place in virtual time: the clock of the
-simulation jumps from one tick (period of the loop) to the next. Such a run writes no log. It
-keeps only the largest errors and speeds and a few sums.
+A parameter sweep needs thousands of runs, but only a few figures of each. Therefore such a run
+writes no log. It keeps only the largest errors and speeds and a few sums. The clock of the
+simulation jumps from one tick (period of the control loop of an arm) to the next.
 
 Invariant:
 
@@ -89,7 +89,7 @@ def max_over_joints(buckets: Array) -> Array:
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns the first column of the numbers that a law sends in its site's row of floats."""
+    """Returns the position of the numbers that a law sends, among all floats of a record."""
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 

@@ -1,20 +1,16 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
 """Compiles numerical functions with Numba, and stores their machine code on disk.
 
-The decorator `leaf` marks a function of numbers and arrays that is to be compiled. A marked
-function is called a leaf.
+A function with the decorator `leaf` is compiled at its first call. Compiling the whole core
+takes long, so later processes load the stored code. Numba has such a cache too, but it does not
+notice a change of a function that the stored function calls.
 
-Where the code is stored:
-    - The machine code is in the user's cache directory, in a folder named after a hash of all
-      source files of this package and of `records.py`, whose constants it contains. Numba alone
-      notices a change of the file that holds a function, but not of the functions that it
-      calls.
-    - A binary wheel contains the same kind of folder, with code for any processor of its
-      platform. This code is used if the cache directory has no code for the present processor.
-
-A leaf that is called from Python is stored as machine code. A leaf that is called by another
-leaf is called an inner leaf. It is stored as LLVM code before optimisation, because it is
-optimised together with its caller.
+- The code is stored in the user's cache directory, in a folder named after a hash of all source
+  files of this package and of `records.py`, whose constants it contains.
+- A binary wheel contains the same kind of folder, with code for any processor of its platform.
+  This code is used if the cache directory has no code for the present processor.
+- A function that is called by another compiled function only, an inner leaf, is stored as LLVM
+  code before optimisation, because it is optimised together with its caller.
 
 Invariant:
     - Floating-point operations are not reordered (no fastmath). Therefore compiled functions
@@ -699,7 +695,7 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Compiles a function now, into a form that does not check the types of its arguments.
+    """Compiles a function for arguments of given types, so that calls need not check the types.
 
     This form saves the time of the check in each call. It must only be called with arguments of
     the same types as those given here. If Numba is disabled, the function itself is returned.
@@ -752,7 +748,9 @@ def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function that computes one stage of several runs, a lane for each (decorator).
+    """Marks a function that computes several runs at once by vector instructions (decorator).
+
+    Each run has a lane, a position in the vector registers.
 
     The loops over the lanes use vector instructions. This needs two guarantees to the compiler,
     which apply to the marked function only: all leaves that it calls become part of its code,
@@ -772,7 +770,7 @@ def _make_unstored(function: Callable[..., Any]) -> Any:
 
 
 def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
-    """Compiles a function of lanes, or loads its code, and returns the address of its code.
+    """Returns the address of a `lane_leaf` function, and compiles the function if needed.
 
     The code is not stored on disk if the attribute `is_stored` of some type is False.
 
@@ -790,7 +788,7 @@ def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, .
 
 
 def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
-    """Returns True if a function of lanes need not be compiled any more.
+    """Returns True if a `lane_leaf` function was compiled and stored on disk before.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -805,7 +803,7 @@ def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any,
 
 
 def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
-    """Returns the machine code of a function of lanes as text, for tests.
+    """Returns the machine code of a `lane_leaf` function as text, for tests.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -821,7 +819,10 @@ def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, 
 def set_lane_form(
     function: Callable[..., Any], choose: Callable[[tuple[Any, ...]], Callable[..., Any]]
 ) -> None:
-    """Gives a leaf another implementation for arguments that are rows in lanes.
+    """Registers another version of a function, for code that computes several runs at once.
+
+    For example, `compute_law` of `execution.lanes.lane_laws` has a version for each control
+    law.
 
     Args:
         function: A function with the decorator `leaf`.

@@ -104,9 +104,10 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
 
 @leaf
 def adapts(s: SiteRow) -> bool:
-    """Returns True if the estimate adapts in the present mode.
+    """Returns True if the estimate of the arm's parameters may change in the present mode.
 
-    It does not adapt in DIVERGED, and at rest only while the law's own torque is in use.
+    It may not change in DIVERGED. While the arm rests, it changes only if the torque at rest is
+    that of the control law, see `rests_by_law`.
     """
     return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
 
@@ -138,13 +139,20 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def updates_estimate(k: int, s: SiteRow) -> bool:
-    """Returns True if stage 5 updates the estimate of the law in a tick, if it adapts."""
+    """Returns True if an adaptive law integrates its estimate in stage 5 of this tick.
+
+    This is not so at the first tick of the site, nor under the scheme `digital`. Whether the
+    estimate adapts in the present mode is decided by `adapts`.
+    """
     return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Writes the sum Y' r of both ticks into `Yr_before`, see `_update_estimate`."""
+    """Adds Y' r of this tick to that of the previous tick, for the trapezoid rule.
+
+    The sum is written into `Yr_before`, see `_update_estimate`.
+    """
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
 
@@ -318,7 +326,7 @@ def _advance_arm(
 
 @leaf
 def hold_motor_torque(k: int, s: SiteRow) -> None:
-    """Begins stage 8: computes the torque that is held over the period.
+    """Begins stage 8: computes the motor torque that is held during the whole period.
 
     It is the torque of the middle of the period, extrapolated linearly:
 
@@ -486,6 +494,9 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 @leaf
 def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
     """Ends stage 3: stops the reference while peers are silent, and limits its speed.
+
+    The reference is the position that the arm follows. It stops if no samples come from the
+    other arms for too long.
 
     Args:
         k: Number of the tick.

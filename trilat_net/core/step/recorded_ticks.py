@@ -1,13 +1,15 @@
-"""Executes recorded ticks of a site again in one compiled loop, and compares their results.
+"""Verifies many recorded control periods of an arm in one compiled loop.
 
-A tick is one period of the control loop of a site, the process that runs one arm. Its record
-contains its inputs, such as the samples (states of other sites) that arrived, and its results.
+A log has a record of each control period (tick), with its inputs, such as the received states
+of the other arms, and its results. The loop computes the ticks again from their inputs and
+compares the results. It does the same as repeated calls of `Site.step`, but faster.
 
 Invariant:
     - The loop calls the stages of the kernel, as `Site.step` does. It contains no equation.
     - A row of the record counts as repeated only if every computed number has the same bits.
     - The loop ends before the first tick that it cannot execute or does not repeat. The site
-      is then in the state before this tick, and `Site.step` can execute it.
+      (the state of the arm and its controller) is then in the state before this tick, and
+      `Site.step` can execute it.
 """
 
 import zlib
@@ -101,7 +103,10 @@ class RecordedRows(NamedTuple):
 
 
 class SiteViews(NamedTuple):
-    """Memory of a site in forms that the compiled loop compares and writes.
+    """State of a site as integers, so that the compiled loop can compare all bits.
+
+    Two floating-point numbers can be equal although their bits differ, such as 0.0 and -0.0,
+    and NaN is not equal to itself. A word is the bits of a number as an integer.
 
     Attributes:
         site: Row of the site, as integers.
@@ -125,7 +130,7 @@ class SiteViews(NamedTuple):
 
 
 class TickRules(NamedTuple):
-    """Properties of a site that do not change during its run.
+    """Properties of a site that stay the same during its run, for the compiled loop.
 
     Attributes:
         rate_hz: Tick rate, Hz.

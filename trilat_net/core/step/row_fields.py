@@ -1,10 +1,10 @@
 """Defines the arrays that hold the state of a simulated arm and of its network links.
 
-The process that runs one arm is called a site. Its state is stored in NumPy structured arrays,
-whose elements are called rows. Each class below describes the fields of one kind of row: their
-shape, unit and meaning, and the stage of a control period that writes them. The types of the
-attributes serve readers and mypy, and `row_dtype` derives the memory layout from the `Field` of
-each attribute. README.md of this folder shows the same information as tables.
+They are NumPy structured arrays, whose elements are called rows. Each class below describes the
+fields of one kind of row, for example `q` in `SiteRow`: their shape, unit and meaning, and the
+stage of a control period that writes them. The types of the attributes serve readers and mypy,
+and `row_dtype` derives the memory layout from the `Field` of each attribute. README.md of this
+folder shows the same information as tables.
 
 Invariant:
     - The order of the attributes is the order of the fields in memory. Digests of runs, cached

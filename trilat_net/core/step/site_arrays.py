@@ -1,10 +1,9 @@
 """Creates the arrays that hold the state of a running arm, and enlarges them during a run.
 
-A site is a process that runs one arm and its control loop. Over network links it receives
-samples, the states of other sites. The arrays contain the state of the arm and its control law
-(`SiteRow`), and the state of each link (`LinkRow`) with its models of delay and loss. They also
-contain a ring buffer per link, called calendar, in which samples wait until their simulated
-delay has passed. Each entry of a calendar is called a page.
+The arrays contain the state of an arm and of its control law (`SiteRow`), and the state of each
+network link (`LinkRow`) over which the arm receives samples, the states of other arms. A ring
+buffer per link, called calendar, keeps samples until their simulated delay has passed. It is
+enlarged when a delay grows during a run.
 
 Structured arrays are used because they are cheap to pass to compiled code, and because their
 fields can have the same names as the symbols in the equations.
@@ -12,8 +11,8 @@ fields can have the same names as the symbols in the equations.
 Invariant:
     - The compiled code of a control period reads and writes nothing but these arrays and
       `TickBuffers`.
-    - Two sites with equal setups have equal arrays.
-    - The links of a site take at most `MAX_LINKS_BYTES` of memory beyond what the delays in the
+    - Two arms with equal setups have equal arrays.
+    - The links of an arm take at most `MAX_LINKS_BYTES` of memory beyond what the delays in the
       setup need.
 """
 
@@ -406,7 +405,10 @@ class CalendarSizer:
         self.newest[peer] = -1
 
     def list_rooms(self) -> list[tuple[int, int]]:
-        """Returns the facts by which `recorded_ticks` checks whether samples fit.
+        """Returns how long samples of each peer may wait in the calendar.
+
+        The compiled loop of `recorded_ticks` needs these numbers to check whether a sample fits
+        into the ring buffer.
 
         Returns:
             For each peer its entry of `newest`, and how many ticks a sample waits at most.

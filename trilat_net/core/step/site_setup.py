@@ -1,8 +1,8 @@
-"""Defines the setup of a site: all numbers and names that are needed to run one arm.
+"""Defines the setup of an arm: all numbers and names that are needed to run its control loop.
 
-A site is a process that runs one arm and its control loop. The setup is derived from a
-scenario, the file that describes an experiment. In contrast to the scenario, the setup has no
-missing values, and refers to other sites by index instead of name.
+The setup is derived from a scenario, the file that describes an experiment. In contrast to the
+scenario, the setup has no missing values, and refers to other arms by index instead of name. An
+arm with its control loop is called a site.
 
 Invariant:
     - All numbers that a site computes depend only on its setup and on the inputs of its control
@@ -171,7 +171,7 @@ class RestGains(NamedTuple):
 
 
 class LinkSetup(NamedTuple):
-    """Setup of the link, the directed connection, from one peer to a site.
+    """Settings of the network link from another arm (a peer) to this one.
 
     Attributes:
         peer: Name of the peer.
@@ -246,7 +246,7 @@ def make_layout(
 
 
 class TaskSetup(NamedTuple):
-    """Setup of an arm whose end effector follows the end effectors of other arms.
+    """Settings of an arm whose end effector follows the end effectors of other arms.
 
     Attributes:
         axes: For each coordinate of the end effector 1 if it follows the other arms, otherwise
@@ -285,7 +285,7 @@ class ChainSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """A control law and its gains; gains of other laws have no effect.
+    """Kind of control law of an arm, and its gains. Gains of other kinds have no effect.
 
     Diagonal matrices are vectors. A vector of one number has this number for all its entries.
 

@@ -1,15 +1,14 @@
 """Runs the control loop of an arm, one period per call of `Site.step`.
 
-A site is a process that runs one arm and its control loop, and a tick is one period of the
-loop. In each tick, a site sends a sample with its state to its peers, the other sites.
-
-`Site.step` writes the samples that arrived into arrays, calls the compiled function
-`kernel.site_tick`, and converts the results to a record. If the control law was written by a
-user, the law is called between the two halves of the tick, which are compiled separately.
+The caller provides the input of a period, for example the states (samples) that arrived from
+other arms, and gets the record with all results. `Site.step` writes the samples into arrays,
+calls the compiled function `kernel.site_tick`, and converts the results to a record. If the
+control law was written by a user, the law is called between the two halves of the period, which
+are compiled separately.
 
 Invariant:
     - Live sessions, simulations and the verification of logs use `Site.step`. Only the fast
-      simulation of all sites (`fused_run`) does not, and it calls the same compiled functions.
+      simulation of all arms (`fused_run`) does not, and it calls the same compiled functions.
     - The result of `Site.step` depends only on the state of the site and on its argument. The
       method reads no clock and no network connection, and draws no random number.
     - Equal inputs give results that are equal to the last bit.
@@ -69,7 +68,7 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class TickParts(NamedTuple):
-    """Parts of a site that execute its ticks.
+    """Parts of a `Site` that `recorded_ticks` needs to execute many of its ticks at once.
 
     Attributes:
         buffers: Input and output of a tick.
@@ -93,7 +92,7 @@ class TickParts(NamedTuple):
 
 
 class Site:
-    """Manipulator with its controller and the receiving ends of its links.
+    """State of one arm with its controller and with the network links over which it receives.
 
     The process of a site creates this object and calls `step` once per tick. The simulation
     in virtual time does the same for each site.

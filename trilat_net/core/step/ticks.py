@@ -1,8 +1,9 @@
-"""Defines the inputs, the results and the times of the control periods of an arm.
+"""Defines the inputs, the results and the times of the control periods (ticks) of an arm.
 
-A site is a process that runs one arm, and a tick is one period of its control loop. The inputs
-of a tick are the samples (states) that arrived from other sites, and commands. Its record is
-the stored result. This module also defines the modes in which a site can be.
+The inputs of a tick are the samples (states) that arrived from other arms, and commands. The
+stored result of a tick is called its record. For example, with a loop at 1000 Hz, tick 250 is
+due 0.25 s after the start of the session. This module also defines the reasons and alarms that
+a log states when an arm starts or stops following the others.
 
 Invariant (laws L1 and L3 of docs/develop/design.md):
     - The nominal time of tick k is `k * 10^9 // rate_hz` nanoseconds after the start of the

@@ -1,10 +1,12 @@
-"""Computes one tick of a site whose arm is a chain of joints, for several runs at once.
+"""Computes one control period of an arm of n joints, for several simulations at once.
 
-The recursions from joint to joint are computed for eight runs at a time, with vectors as
-numbers, see `lane_vectors`. All other stages are loops over the lanes, as in `lane_stages`.
+`lane_stages` does the same for planar arms. The recursions from joint to joint are computed for
+eight runs at a time, with `lane_vectors`. All other stages are loops over the runs, each of
+which has its own lane (position in the vector registers).
 
 Invariant:
-    - No equation of a tick is repeated here. The order of the stages is that of `kernel`.
+    - No equation is repeated here. The functions and the order of the stages are those of
+      `kernel`.
     - The frames of the joints of all lanes are up to date wherever a function of one lane needs
       them. Therefore `place_joints` does nothing in one lane.
 """
@@ -42,37 +44,37 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def _place_nothing(_chain: Any, _q: Any) -> None:
-    """Form of `place_joints` for one lane: the joints have been placed with those of others."""
+    """Version of `place_joints` for one lane: all joints have been placed before."""
 
 
 def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
-    """Form of `put_gravity_torque` for one lane: the torque has been computed with others."""
+    """Version of `put_gravity_torque` for one lane: all have been computed before."""
 
 
 def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the form of `place_joints` for given types of its arguments."""
+    """Returns the version of `place_joints` for the types of the arguments."""
     dispatcher: Any = place_joints
     is_one_lane = isinstance(argument_types[0], RowsInLane)
     return _place_nothing if is_one_lane else dispatcher.py_func
 
 
 def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the form of `put_gravity_torque` for given types of its arguments."""
+    """Returns the version of `put_gravity_torque` for the types of the arguments."""
     dispatcher: Any = chain_stages.put_gravity_torque
     is_one_lane = isinstance(argument_types[0], LaneRow)
     return _put_no_gravity if is_one_lane else dispatcher.py_func
 
 
 def _skip_pose(_s: Any, _chain: Any) -> None:
-    """Form of `update_pose` for eight runs: no site in lanes shares poses."""
+    """Version of `update_pose` for eight runs that does nothing: they use no task space."""
 
 
 def _skip_task_errors(_s: Any) -> None:
-    """Form of `update_task_errors` for eight runs."""
+    """Version of `update_task_errors` for eight runs that does nothing, without task space."""
 
 
 def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torque: Any) -> None:
-    """Form of `add_task_torque` for eight runs."""
+    """Version of `add_task_torque` for eight runs that does nothing: they use no task space."""
 
 
 def _skip_group(function: Any, skipped: Callable[..., None]) -> None:

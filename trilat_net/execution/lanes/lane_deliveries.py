@@ -1,8 +1,11 @@
-"""Decides for blocks of ticks which sample of each peer a site uses, without the samples.
+"""Computes in advance which received states each arm uses, for a block of control periods.
 
-A sample is the state that a site sends in one tick, a period of its control loop. Its delivery
-depends on the link and on the index of the sample alone. Therefore the deliveries of many ticks
-are computed together, before the ticks.
+In each control period (tick), every arm sends its state, a sample, to the other arms over a
+simulated network. The delay and the loss of a sample depend on the link and on the number of
+the sample, but not on its content. Therefore the deliveries of many ticks can be computed
+before the arms move. Random numbers are then drawn for many samples in one call.
+
+Example: with a delay of 3 ticks, tick 10 uses sample 7, whatever the arms do.
 
 Invariant:
     - The samples in use are those of `accept_sample` and `release_sample`, if all sites have
@@ -59,7 +62,7 @@ _UNIFORM = int(DelayKind.UNIFORM)
 
 
 class DelayNumbers(NamedTuple):
-    """Parameters of a delay model without a memory, as `draw_delay_us` reads them.
+    """Parameters of a random delay that does not depend on earlier delays, for `draw_delay_us`.
 
     In contrast to a row of the table of models, the kind can be known to the compiler, which
     then removes the branches for other kinds. See `DelayKind` for the meaning of the others.
@@ -73,7 +76,7 @@ class DelayNumbers(NamedTuple):
 
 
 class LinkStates(NamedTuple):
-    """State of all links of the runs in L lanes, for N sites with P peers each.
+    """State of the simulated network of several runs: L runs with N sites and P peers each.
 
     Attributes:
         links: Rows of the links, shape (L, N, P), see `LinkRow`.
@@ -98,7 +101,7 @@ class LinkStates(NamedTuple):
 
 
 def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
-    """Returns the state of the links of runs before their first tick.
+    """Copies the state of the links of several runs, before their first tick, to common arrays.
 
     Args:
         tables: Arrays of all sites of each run. They are not changed.
@@ -127,7 +130,7 @@ def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
 
 
 def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
-    """Returns the state of the links of some lanes.
+    """Returns the state of the network links of those runs that continue.
 
     Args:
         states: The state of all lanes.
@@ -202,7 +205,7 @@ def _draw_uniform_delays(
 
 @lane_leaf
 def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -> None:
-    """Draws the two random numbers that decide on the loss of each of several samples.
+    """Draws two random numbers for each of several samples, which decide whether it is lost.
 
     Args:
         first: Index of the first sample.
@@ -217,7 +220,7 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
 
 
 class DrawAddresses(NamedTuple):
-    """Addresses of the functions that draw random numbers of several samples at once.
+    """Addresses of compiled functions that draw the random numbers of many samples in one call.
 
     Their loops use vector instructions, which needs all functions in them to be inlined.
     """
@@ -227,7 +230,7 @@ class DrawAddresses(NamedTuple):
 
 
 def find_draw_addresses() -> DrawAddresses:
-    """Compiles the functions that draw random numbers, or loads their code."""
+    """Returns the addresses of these functions, and compiles the functions if needed."""
     integer = types.int64
     number = types.float64
     delays = types.Array(integer, 1, "C")
@@ -406,7 +409,7 @@ def use_samples(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds which sample of each peer every site of several runs uses, for a block of ticks.
+    """Computes which sample of each peer the sites of several runs use, for a block of ticks.
 
     Args:
         first: First tick of the block.
@@ -474,7 +477,7 @@ def use_recorded_samples(
     state: Array,
     used: IntArray,
 ) -> int:
-    """Finds the samples in use in a recorded run, whose arrivals are known, see `use_samples`.
+    """Computes the same as `use_samples` for a run from a log, in which all arrivals are known.
 
     Args:
         first: First tick of the block.
@@ -539,7 +542,11 @@ def repeat_deliveries(
     joints: int,
     states: Array,
 ) -> None:
-    """Executes the links of a run for some ticks, without the arms.
+    """Brings the network links of a run up to date after its ticks were computed in a lane.
+
+    The lanes compute the deliveries without the state of the links (`use_samples`). A run that
+    continues alone needs this state, so the links are executed again for the past ticks,
+    without the arms.
 
     The links then have the state that a run of these ticks gives them. Samples that were
     overwritten long ago have the wrong content, but the right index.

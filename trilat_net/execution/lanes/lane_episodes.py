@@ -1,7 +1,9 @@
-"""Advances runs of one structure side by side that begin at different times.
+"""Simulates several episodes at once that begin and end at different times.
 
-A run in a lane is replaced by another one when it has ended. Therefore each lane has a clock of
-its own. In each run a program may move the arm of one site; its actions come from outside.
+A training environment with many copies uses this module: when the episode of one copy has
+ended, a new one takes its lane (position in the vector registers), while the others continue.
+Therefore each lane has a clock of its own. In each run, a program may move one arm. The caller
+provides the actions of all programs as an array.
 
 Invariant:
     - After each call of `advance`, a run has the state that `FusedRun.step_to` gives it with
@@ -47,7 +49,7 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the samples that are used in a span of ticks, which differs from lane to lane.
+    """Computes which samples all runs use in their next ticks, which differ from lane to lane.
 
     Args:
         runs: Number of runs.
@@ -92,7 +94,7 @@ def _use_samples_of_lanes(
 def _put_actions(
     actions: Array, hand_row: int, columns: IntArray, actors: Array, runs: int
 ) -> None:
-    """Writes the actions of all programs in a tick into the rows of their operators.
+    """Passes the actions of all programs in a tick to the operators of the simulated arms.
 
     Args:
         actions: The actions, shape (5, LANES).
@@ -131,7 +133,7 @@ def _run_span(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Steps all sites of several runs through a span of ticks, as `run_block` does.
+    """Simulates several runs for some ticks, like `run_block` but with a clock for each run.
 
     Args:
         first: First tick of each run, shape (LANES,).
@@ -222,7 +224,10 @@ def _run_span(
 
 
 class LaneEpisodes(LaneRun):
-    """Runs of one structure, each in a lane, that begin and end at different times.
+    """Simulates the episodes of several environments together, each in one lane.
+
+    When an episode has ended, `load` puts a new run into its lane, while the other lanes
+    continue.
 
     Args:
         run: Any run of this structure before its first tick, see `explain_run`.
@@ -266,12 +271,12 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def find_structure(run: FusedRun) -> RunStructure:
-        """Returns what the runs must have in common. They may end at different times."""
+        """Returns the properties in which all runs must agree, which exclude the duration."""
         return find_structure(run)._replace(duration_s=0.0)
 
     @staticmethod
     def explain_hand(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Explains why the steps of a program cannot be computed in lanes, or returns "".
+        """Returns why the actions of a program cannot be computed in lanes, or "" if they can.
 
         Args:
             rules: Limits of the program's hand.
@@ -284,7 +289,9 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: FusedRun, hand_site: int) -> str:
-        """Explains why a run cannot be computed in lanes, or returns "".
+        """Returns why a run cannot be computed in lanes, or "" if it can.
+
+        To find out, this function compiles the code.
 
         The code is compiled for this answer.
 
@@ -296,7 +303,7 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
-        """Puts a run into a lane, in place of the run that was there.
+        """Starts a new episode: puts a run into a lane, in place of the run that was there.
 
         Args:
             lane: The lane.
@@ -328,7 +335,7 @@ class LaneEpisodes(LaneRun):
         self.runs[lane] = run
 
     def _load_links(self, lane: int, run: FusedRun) -> None:
-        """Puts the links of a run into a lane, and makes room for them if necessary."""
+        """Copies the state of a run's network links into a lane, and enlarges the arrays."""
         tables = run.memory.tables
         links = self._deliveries
         pages = tables.calendars.shape[2]
@@ -367,7 +374,9 @@ class LaneEpisodes(LaneRun):
         goals: Array,
         locate: Callable[[Array], Array],
     ) -> None:
-        """Steps the runs through a span of ticks. A run ends if an arm of it leaves its limits.
+        """Simulates all episodes for some ticks, with the decisions of their programs.
+
+        A run ends if one of its arms leaves its limits.
 
         Args:
             count: Number of ticks, at most `BLOCK_TICKS`.
@@ -402,7 +411,7 @@ class LaneEpisodes(LaneRun):
         self._step_span(count, idle)
 
     def _step_span(self, count: int, idle: IntArray) -> None:
-        """Steps the runs through a span of ticks, with the actions of their programs.
+        """Simulates all runs for some ticks, with the actions of their programs.
 
         Args:
             count: Number of ticks.
@@ -470,7 +479,11 @@ class LaneEpisodes(LaneRun):
         return self._ended.ticks[: len(self.runs)] >= 0
 
     def read_site(self, name: str) -> NDArray[Any]:
-        """Returns a field of the rows of all sites, shape (N, runs, numbers)."""
+        """Returns one quantity of all sites in all runs, shape (N, runs, numbers).
+
+        Args:
+            name: Name of the quantity, a field of `SiteRow`, for example "q".
+        """
         dtype: Any = self._layout.site.fields[name][0]  # type: ignore[index]
         return self._read(self._site, self._ended.site_rows, self._layout.site, name, dtype)
 
@@ -514,7 +527,7 @@ class LaneEpisodes(LaneRun):
         return is_new
 
     def write_back(self, lane: int) -> None:
-        """Writes the state of the sites and of the samples in use into the run of a lane.
+        """Copies the present state of a lane into its `FusedRun`, where the caller reads it.
 
         The run cannot continue alone from there: its links still have their first state.
 
@@ -533,7 +546,12 @@ class LaneEpisodes(LaneRun):
 
 
 def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns the words of a field in a row."""
+    """Returns the indices of a field's numbers among all numbers of a row.
+
+    Args:
+        layout: Data type of the row.
+        name: Name of the field.
+    """
     fields: Any = layout.fields
     dtype, offset, *_ = fields[name]
     return range(offset // 8, (offset + dtype.itemsize) // 8)

@@ -1,17 +1,17 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return"
-"""Computes the torque of compiled control laws for several runs side by side.
+"""Compiles control laws into the simulation of several runs at once.
 
-A compiled law is a class that is not a part of the kernel, for example `tdpa` or a law of a
-user. The kernel calls the method `torque` by its address. In lanes the method is compiled as a
-part of the tick, with rows in a lane as its input. This saves the call and the checks of the
-lengths of all vectors, which are constants here.
+Laws such as `tdpa`, and those that users write, are classes with a method `torque`. In a single
+run, the simulation calls the compiled method by its address. For several runs, each in one lane
+of the vector registers, the method is compiled as a part of the control period instead. This
+saves the call, and the checks of the lengths of all vectors, which are constants here.
 
 Invariant:
     - The method is not changed. It raises the same errors, and reads and writes the same
       numbers, as in a run of its own.
-    - A law of a user is compiled in each process, because it may use files that are unknown. A
-      law of this package is stored under a hash of its sources.
+    - A user's law is compiled in each process, because the other files that it uses are
+      unknown. The code of a built-in law is stored under a hash of its sources.
 """
 
 import hashlib
@@ -47,7 +47,9 @@ NO_LAW = "none"
 
 
 class LaneLaw(NamedTuple):
-    """A compiled law of one site in a run, as far as it decides about the compiled code.
+    """Properties of a site's compiled control law on which the code of its tick depends.
+
+    Runs for which these properties are equal share the code.
 
     Attributes:
         name: Name of the law, from all that its code depends on. `NO_LAW` without such a law.
@@ -67,7 +69,7 @@ class LaneLaw(NamedTuple):
 
 
 class _LawMethod(NamedTuple):
-    """The method of a law that computes its torque, and the layouts of its arrays."""
+    """Method `torque` of a control law, and the data types of its arrays."""
 
     torque: Callable[..., Any]
     form: LawForm
@@ -80,7 +82,7 @@ _user_law_numbers = count()
 
 @cache
 def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
-    """Returns a name for a law, and whether its code may be stored under this name."""
+    """Returns a name for the code of a law, and whether the code may be stored on disk."""
     sources = digest_sibling_sources(torque)
     text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
     name = hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -91,7 +93,7 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
 
 
 def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
-    """Returns what decides about the compiled code of a site's law.
+    """Returns the properties of a site's law on which the compiled code of its tick depends.
 
     Args:
         law: The law; None if the law of the site is a part of the kernel.
@@ -118,7 +120,9 @@ def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
 
 
 class LawCode(types.Type):
-    """Numba's type of a value that stands for the code of a law.
+    """Numba's type of an argument that tells the compiler which control law to call.
+
+    The argument has no value at run time: its type alone selects the code.
 
     Args:
         law: The law.
@@ -141,7 +145,7 @@ class LawCode(types.Type):
 
 @register_model(LawCode)
 class _CodeModel(models.PrimitiveModel):
-    """The value is a pointer, which is not used."""
+    """Represents a `LawCode` in machine code by a pointer that is not used."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -150,7 +154,7 @@ class _CodeModel(models.PrimitiveModel):
 def _make_view(
     dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
 ) -> Any:
-    """Returns a compiled function that reads the numbers of a row as rows of another layout.
+    """Returns a compiled function that reads the numbers of a row as a row with named fields.
 
     Args:
         dtype: Layout of the rows. None if there are no such rows.
@@ -180,7 +184,7 @@ def _make_view(
 
 @register_jitable
 def _no_rows(_numbers: Any) -> tuple[()]:
-    """Returns no rows, in place of a view of rows."""
+    """Returns nothing, in place of the vectors that a law of this kind does not exchange."""
     return ()
 
 
@@ -206,7 +210,7 @@ def compute_law(
     received: RowArray,
     sent: RowArray,
 ) -> None:
-    """Computes the torque of a compiled law in one lane, see `law_stage`.
+    """Computes the torque of a compiled control law for one of the runs, see `law_stage`.
 
     Nothing happens if the law of the site is a part of the kernel.
 
@@ -236,11 +240,11 @@ def _compute_nothing(
     _received: Any,
     _sent: Any,
 ) -> None:
-    """Form of `compute_law` for a site whose law is a part of the kernel."""
+    """Version of `compute_law` that does nothing: the kernel computes the law of this site."""
 
 
 def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the form of `compute_law` for the law of a site."""
+    """Returns the version of `compute_law` for the law of a site."""
     code = argument_types[0]
     if code.law_name == NO_LAW:
         return _compute_nothing

@@ -1,13 +1,16 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Defines rows of several runs side by side, which compiled code reads like rows of one run.
+"""Stores the states of several runs side by side, so that loops use vector instructions.
 
-A lane is the position of one run among runs that are computed together. Each number of a row of
-one run becomes `LANES` numbers, which are adjacent in memory. Therefore a loop over the lanes
-can use vector instructions. The functions of the kernel are called with a row in one lane. It
-has the same fields as a row of one run, so that no function of the kernel needs a second form.
+The state of an arm in one run is a row of numbers (`row_fields`). Here each number becomes
+`LANES` numbers that are adjacent in memory, one for each run. For example, the first joint
+angles of all runs follow each other, so one instruction loads several of them. The position of
+a run among the others is called its lane.
 
-Fields that have the same value in all lanes can be constants, for example the control law. The
+The functions of a control period get an object that stands for the row of one lane, with the
+same fields as the row of a single run. No function needs a second version.
+
+Fields that are equal in all lanes, such as the kind of control law, can be constants. The
 compiler then removes the branches for other values.
 
 Invariant:
@@ -52,7 +55,7 @@ Constants = tuple[tuple[str, int], ...]
 
 
 class LaneField(NamedTuple):
-    """A field of a row in lanes.
+    """One field of a row, with its position among the numbers of the row.
 
     Attributes:
         name: Name of the field.
@@ -68,7 +71,9 @@ class LaneField(NamedTuple):
 
 
 class LaneTable(types.Type):
-    """Numba's type of a table of rows in all lanes, a pointer to its first number.
+    """Numba's type of an array that holds the rows of all lanes, such as the states of an arm.
+
+    A value of this type is a pointer to the first number of the array.
 
     Args:
         dtype: Data type of a row of one run. All its numbers have 64 bits.
@@ -96,12 +101,12 @@ class LaneTable(types.Type):
 
     @property
     def count(self) -> int:
-        """Number of rows with constants of their own."""
+        """Number of rows that have fields of their own that are equal in all lanes."""
         return len(self.constants)
 
 
 class _PartOfTable(LaneTable):
-    """Type of a part of a table in one lane, with the fields of the table."""
+    """Numba's type of some rows of a `LaneTable` in one lane."""
 
     def __init__(self, table: LaneTable, constants: tuple[Constants, ...]) -> None:
         self.fields = table.fields
@@ -111,23 +116,26 @@ class _PartOfTable(LaneTable):
 
 
 class RowsInLane(_PartOfTable):
-    """Type of all rows of a table in one lane."""
+    """Numba's type of all rows that belong to one lane, for example of all links of an arm."""
 
 
 class LaneRow(_PartOfTable):
-    """Type of one row of a table in one lane."""
+    """Numba's type of one row in one lane, which functions use like the row of a single run."""
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the field of a name, or None."""
+        """Returns the field with this name, or None if the row has none."""
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is equal in all lanes, or None."""
+        """Returns the value of a field if it is the same in all lanes, else None."""
         return dict(self.constants[0]).get(name)
 
 
 class LaneNumbers(types.Type):
-    """Numba's type of one integer per lane, a pointer to the first one."""
+    """Numba's type of an array with one integer per lane, such as the present tick.
+
+    A value of this type is a pointer to the first integer.
+    """
 
     in_lanes = True
 
@@ -143,7 +151,7 @@ class LaneNumbers(types.Type):
 @register_model(LaneNumbers)
 @register_model(LaneTable)
 class _TableModel(models.PrimitiveModel):
-    """A table is represented by a pointer."""
+    """Represents a `LaneTable` in machine code by a pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -152,7 +160,7 @@ class _TableModel(models.PrimitiveModel):
 @register_model(RowsInLane)
 @register_model(LaneRow)
 class _RowModel(models.StructModel):
-    """Rows in a lane are represented by a pointer to the first row and a lane's index."""
+    """Represents rows in a lane in machine code by a pointer and the lane's index."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         members = [("pointer", types.voidptr), ("lane", types.intp)]
@@ -160,12 +168,14 @@ class _RowModel(models.StructModel):
 
 
 def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
-    """Generates the address that lies so many bytes behind a pointer."""
+    """Generates LLVM code for an address that lies a number of bytes behind a pointer."""
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
 
 
 def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
-    """Generates the address of rows that begin so many numbers behind a pointer to rows.
+    """Generates LLVM code for the address of rows that begin `words` numbers behind a pointer.
+
+    Each number of a row occupies `LANES` numbers in memory.
 
     Args:
         builder: Appends LLVM instructions.
@@ -178,7 +188,7 @@ def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
 
 @infer_getattr
 class _RowAttributes(AttributeTemplate):
-    """Types of the fields of a row in a lane."""
+    """Tells Numba the type of `row.field` for a row in a lane."""
 
     key = LaneRow
 
@@ -194,7 +204,7 @@ class _RowAttributes(AttributeTemplate):
 
 @infer_getattr
 class _RowsAttributes(AttributeTemplate):
-    """Rows in a lane have the shape (count,)."""
+    """Tells Numba the type of `rows.shape`, which is (count,), for rows in a lane."""
 
     key = RowsInLane
 
@@ -205,7 +215,7 @@ class _RowsAttributes(AttributeTemplate):
 def _find_number(
     context: Any, builder: Any, row_type: LaneRow, row_value: Any, field: LaneField
 ) -> Any:
-    """Generates the address of the first number of a field in the lane of a row."""
+    """Generates LLVM code for the address of a field's first number in a lane."""
     row = cgutils.create_struct_proxy(row_type)(context, builder, value=row_value)
     word = row.lane.type
     in_lane = builder.mul(row.lane, ir.Constant(word, _WORD))
@@ -217,7 +227,7 @@ def _find_number(
 
 @lower_getattr_generic(LaneRow)
 def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
-    """Generates the reading of a field: a constant, a number, or a view of an array."""
+    """Generates LLVM code for reading `row.field`: a constant, a number or an array."""
     constant = row_type.find_constant(name)
     if constant is not None:
         return context.get_constant(types.int64, constant)
@@ -252,7 +262,7 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
 
 @lower_setattr_generic(LaneRow)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Generates the writing of a number."""
+    """Generates LLVM code for writing a number to `row.field`."""
     row_type, value_type = sig.args
     row, value = args
     field = row_type.find_field(name)
@@ -263,7 +273,7 @@ def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> 
 
 @lower_getattr_generic(RowsInLane)
 def _read_shape(context: Any, builder: Any, rows: RowsInLane, _value: Any, _name: str) -> Any:
-    """Generates the shape of rows in a lane, which is a constant."""
+    """Generates LLVM code for `rows.shape` of rows in a lane, which is a constant."""
     count = context.get_constant(types.intp, rows.count)
     return context.make_tuple(builder, types.UniTuple(types.intp, 1), [count])
 
@@ -276,7 +286,7 @@ def _find_row(
     index: Any,
     row_type: Any,
 ) -> Any:
-    """Generates the row of an index, of the type `row_type`."""
+    """Generates LLVM code for the row with an index, of the type `row_type`."""
     rows = cgutils.create_struct_proxy(rows_type)(context, builder, value=rows_value)
     row = cgutils.create_struct_proxy(row_type)(context, builder)
     row_bytes = ir.Constant(index.type, rows_type.row_length * LANES * _WORD)
@@ -287,7 +297,7 @@ def _find_row(
 
 @infer_global(operator.getitem)
 class _RowsItem(AbstractTemplate):
-    """The type of `rows[index]`, if all rows have the same constants."""
+    """Tells Numba the type of `rows[index]`, if all rows have the same constants."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
@@ -301,13 +311,13 @@ class _RowsItem(AbstractTemplate):
 
 @lower_builtin(operator.getitem, RowsInLane, types.Integer)
 def _get_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Generates `rows[index]`."""
+    """Generates LLVM code for `rows[index]`."""
     return _find_row(context, builder, sig.args[0], args[0], args[1], sig.return_type)
 
 
 @infer_global(len)
 class _RowsLength(AbstractTemplate):
-    """The type of `len(rows)`."""
+    """Tells Numba the type of `len(rows)`."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         (rows,) = args
@@ -316,13 +326,13 @@ class _RowsLength(AbstractTemplate):
 
 @lower_builtin(len, RowsInLane)
 def _get_length(context: Any, _builder: Any, sig: Any, _args: Any) -> Any:
-    """Generates `len(rows)`, which is a constant."""
+    """Generates LLVM code for `len(rows)`, which is a constant."""
     return context.get_constant(types.intp, sig.args[0].count)
 
 
 @intrinsic
 def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
-    """Generates the rows of a table in one lane."""
+    """Generates LLVM code for the rows of an array that belong to one lane."""
     rows_type = RowsInLane(table, table.constants)
 
     def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
@@ -335,7 +345,7 @@ def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _select_row(_context: Any, rows: Any, index: Any) -> Any:
-    """Generates the row of an index that is known to the compiler."""
+    """Generates LLVM code for a row whose index is known to the compiler."""
     if not isinstance(index, types.IntegerLiteral):
         return None
     number = index.literal_value
@@ -350,7 +360,7 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
 
 @intrinsic
 def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
-    """Generates the integer of a lane, or the integer that all lanes share."""
+    """Generates LLVM code for the integer of one lane, which all lanes may share."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         numbers_type = sig.args[0]
@@ -368,7 +378,7 @@ def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
 
 @intrinsic
 def _pointer_to(_context: Any, address: Any) -> Any:
-    """Generates the conversion of an address to a pointer."""
+    """Generates LLVM code for the conversion of an address to a pointer."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
@@ -390,7 +400,10 @@ pointer_to: Any = _pointer_to
 
 
 def allocate_words(rows: int, row_length: int) -> Words:
-    """Returns zeros that begin at a cache line, shape (rows, words, LANES).
+    """Returns an array of zeros for the rows of all lanes, aligned to a cache line.
+
+    The shape is (rows, numbers of a row, LANES). Vector instructions read an aligned array
+    faster.
 
     Args:
         rows: Number of rows.
@@ -403,7 +416,9 @@ def allocate_words(rows: int, row_length: int) -> Words:
 
 
 def read_words(rows: NDArray[Any]) -> Words:
-    """Returns rows of one run as words, shape (rows, words of a row).
+    """Returns the numbers of structured rows as integers with the same bits ("words").
+
+    The shape is (rows, numbers of a row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

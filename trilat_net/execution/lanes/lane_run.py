@@ -1,10 +1,13 @@
-"""Advances several runs of one structure together, a lane for each.
+"""Simulates up to `LANES` runs together, each in one lane of the vector registers.
+
+`LaneRun` takes runs with equal structure, for example the points of a sweep over a gain, and
+advances them to a time. It is the counterpart of `FusedRun`, which simulates one run.
 
 Invariant:
     - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
       for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries of
       ring buffers that are not used any more, may differ.
-    - The tables of the lanes do not overlap in memory, as `advance_site` requires.
+    - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,7 +57,7 @@ _STATE_FIELDS = ("q", "qd", "tau_x")
 
 
 class SiteTables(NamedTuple):
-    """The tables of one site in all lanes, in the order of the arguments of `advance_site`.
+    """Arrays with the state of one site in all lanes, as `advance_site` takes them.
 
     Attributes:
         site: Row of the site.
@@ -92,7 +95,7 @@ class SiteTables(NamedTuple):
 
 
 class LaneLayout(NamedTuple):
-    """Layouts of the tables of a run.
+    """Data types and lengths of the arrays of a run, on which its code depends.
 
     Attributes:
         site: Of the row of a site.
@@ -126,7 +129,7 @@ class LaneLayout(NamedTuple):
 
 
 def find_layout(run: FusedRun) -> LaneLayout:
-    """Returns the layouts of the tables of a run."""
+    """Returns the data types and lengths of all arrays of a run, on which its code depends."""
     memory = run.memory
     tables = memory.tables
     return LaneLayout(
@@ -152,7 +155,7 @@ def list_argument_types(
     site: SiteStructure,
     clock: types.Type = types.int64,
 ) -> tuple[Any, ...]:
-    """Returns Numba's types of the arguments of `advance_site` for a site.
+    """Returns Numba's types of the arguments with which the tick of a site is compiled.
 
     Args:
         layout: Layouts of the tables.
@@ -206,12 +209,12 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
 
 
 def choose_code(layout: LaneLayout) -> Callable[..., None]:
-    """Returns the function that computes a tick of a site in lanes."""
+    """Returns the function that computes a tick in lanes, for planar arms or for chains."""
     return advance_site if layout.chain is None else advance_chain_site
 
 
 def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -> IntArray:
-    """Compiles the code of each site of a run, or loads it, and returns its addresses.
+    """Returns the addresses of the code for a tick of each site, and compiles it if needed.
 
     Args:
         run: The run.
@@ -230,7 +233,10 @@ def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -
 
 
 def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
-    """Explains why the laws of a run cannot be compiled in lanes, although they can be alone.
+    """Returns why a control law cannot be compiled for several runs at once, for a message.
+
+    Such a law may still be compiled for a single run. To find out, this function compiles the
+    code.
 
     The code is compiled for this answer.
 
@@ -249,7 +255,7 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
-    """Returns the machine code of the ticks of a site in lanes as text, for tests.
+    """Returns the machine code of the ticks of a site as text, in which tests look for vectors.
 
     Args:
         run: The run.
@@ -281,7 +287,9 @@ def _copy_records(first: int, kept: Array, records: Array) -> None:
 
 
 def has_lane_code(run: FusedRun) -> bool:
-    """Returns True if the code for a run in lanes exists already.
+    """Returns True if the code for these runs has been compiled and stored before.
+
+    The runs can then start at once.
 
     Args:
         run: The run. There must be no obstacle, see `find_obstacle`.
@@ -295,7 +303,7 @@ def has_lane_code(run: FusedRun) -> bool:
 
 
 class _LinksOfRun:
-    """The links of a run in a lane, which are brought up to date only if the run needs them.
+    """Brings the network links of a run up to date, but only if the run needs them.
 
     Args:
         run: The run before its first tick.
@@ -320,7 +328,7 @@ class _LinksOfRun:
         self._run.pending_deliveries = partial(self._update, ticks, links, states, received)
 
     def _update(self, ticks: int, links: NDArray[Any], states: Array, received: Array) -> None:
-        """Brings the links of the run up to date, see `set_pending`."""
+        """Computes the state of the links up to the tick that `set_pending` noted."""
         memory = self._run.memory
         tables = memory.tables
         repeat_deliveries(
@@ -345,7 +353,7 @@ class _LinksOfRun:
 
 
 class LaneRun:
-    """Several runs of one structure that advance together, each in a lane of its own.
+    """Simulates several runs of equal structure together with vector instructions.
 
     Args:
         runs: The runs before their first tick, at most `LANES`. They must have the same
@@ -540,7 +548,7 @@ class LaneRun:
         )
 
     def _step_to(self, ticks: int) -> None:
-        """Steps all runs until they have made a number of ticks, or have ended.
+        """Simulates all runs until they have made a number of ticks, or have ended.
 
         Args:
             ticks: Number of ticks since the start of the runs.
@@ -575,7 +583,7 @@ class LaneRun:
             self._ticks += count
 
     def _list_present(self) -> EndedRuns:
-        """Returns the tables of all runs now, see `keep_ended_runs`."""
+        """Returns the present state of all runs, as `keep_ended_runs` reads it."""
         return EndedRuns(
             ticks=self._ended.ticks,
             site_rows=self._site,
@@ -607,7 +615,7 @@ class LaneRun:
             self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Removes all runs but some from the lanes, so that only these advance further.
+        """Continues with some of the runs only, so that no time is spent on the others.
 
         Args:
             chosen: Indices of the runs to keep in `runs`, in rising order. None of them may
@@ -712,12 +720,12 @@ class LaneRun:
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
-    """Returns a table of shape (N, rows, columns) as N words rows."""
+    """Returns an array of shape (N, rows, columns) as N structured rows, without copying it."""
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the rows of site i of a table with the same number of rows for each site."""
+    """Returns the rows that belong to site i. Each site has the same number of rows."""
     rows = len(table) // sites
     return table[i * rows : (i + 1) * rows]
 
@@ -731,7 +739,12 @@ def _check_distinct(tables: SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured rows by their words, shape (rows, words of a row)."""
+    """Overwrites structured rows by numbers given as integers with the same bits ("words").
+
+    Args:
+        rows: The rows; written.
+        numbers: The numbers, shape (rows, numbers of a row).
+    """
     new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
     rows[...] = new_rows.reshape(rows.shape)
 

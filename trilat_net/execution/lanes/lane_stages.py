@@ -1,11 +1,12 @@
-"""Computes one tick of a site for several runs at once, with the functions of the kernel.
+"""Computes one control period of an arm for several runs at once.
 
-A lane is the position of one run among runs that are computed together. A tick is one period of
-the control loop. Each stage is a loop over the lanes that calls the functions of the kernel.
-The stages are loops of their own, so that each one uses vector instructions.
+Each run has a lane, a position in the vector registers of the processor. Each stage of the
+period, for example the torque of the control law, is a loop over the lanes that calls the
+function of the kernel for one run. The stages have loops of their own, so that the compiler
+turns each loop into vector instructions.
 
 Invariant:
-    - No equation of a tick is repeated here.
+    - No equation of a control period is repeated here.
     - The numbers of a lane do not depend on the other lanes.
 """
 
@@ -69,12 +70,12 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Form of `torque_on_arm` for an arm without operators and environments."""
+    """Version of `torque_on_arm` for an arm without operators and environments."""
     return NO_TORQUE
 
 
 def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
-    """Returns a form of `torque_on_arm` for a number of operators and environments.
+    """Returns a version of `torque_on_arm` for a fixed number of operators and environments.
 
     Each of them has a kind that is known to the compiler. Therefore it is not selected by the
     variable of a loop.
@@ -104,7 +105,7 @@ def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
 
 
 def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]:
-    """Returns the form of `torque_on_arm` for given types of its arguments."""
+    """Returns the version of `torque_on_arm` for the types of the arguments."""
     actors = argument_types[4]
     return _unroll_sources(actors.count)
 
@@ -401,7 +402,7 @@ def advance_site(
 
 
 class EndedRuns(NamedTuple):
-    """The numbers of runs at the instant at which an arm of theirs left its limits.
+    """States of runs that have ended, at the time at which one of their arms left its limits.
 
     A run that has ended stays in its lane, and its later numbers have no meaning. N is the
     number of sites, and the last axis of each array is the lane.
@@ -433,7 +434,7 @@ class EndedRuns(NamedTuple):
 
 @leaf
 def copy_lane(lane: int, source: Words, target: Words) -> None:
-    """Copies the numbers of one lane.
+    """Copies all numbers of one run (lane) from one array to another.
 
     Args:
         lane: The lane.
@@ -456,7 +457,9 @@ def keep_ended_runs(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Keeps the numbers of runs of which an arm left its limits in the present tick.
+    """Stores the final state of each run in which an arm left its limits in this tick.
+
+    The other runs continue, so the numbers in the lane of an ended run are overwritten later.
 
     Args:
         ticks: Number of ticks that the runs have made, of all runs or of each run.
@@ -513,7 +516,7 @@ def run_block(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Steps all sites of several runs, up to the end of a block or until all runs have ended.
+    """Simulates several runs for a block of ticks, or until all of them have ended.
 
     Args:
         first: First tick of the block.

@@ -1,7 +1,9 @@
-"""Decides which runs can be computed together in lanes, and which need to run alone.
+"""Decides which simulations can be computed together with vector instructions.
 
-Runs can be computed together if they differ in numbers only. Properties that decide which
-equations are evaluated, for example the control law, form the structure of a run.
+Vector instructions evaluate the same equations for several runs. Runs can therefore be computed
+together if they differ in numbers only, such as gains or start poses. Properties that select
+the equations, for example the kind of control law, form the structure of a run. `find_obstacle`
+tells why a run must be computed alone.
 
 Invariant:
     - Two runs with the same structure use the same compiled code and the same number tables.
@@ -29,7 +31,7 @@ _ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
 
 
 class SiteStructure(NamedTuple):
-    """Structure of one site of a run.
+    """Properties of one site that select its equations, such as the kind of its control law.
 
     Attributes:
         constants: Constants of the site.
@@ -45,7 +47,7 @@ class SiteStructure(NamedTuple):
 
 
 class RunStructure(NamedTuple):
-    """Structure of a run. Runs with the same structure can be computed together.
+    """Properties of a run that select its equations. Runs with equal properties share code.
 
     Attributes:
         sites: Structure of each site.
@@ -75,7 +77,7 @@ def _list_actors(actors: Any) -> list[Any]:
 
 
 def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
-    """Explains why a run cannot be computed together with other runs.
+    """Returns why a run cannot be computed together with other runs, for a message to the user.
 
     Args:
         run: The run before its first tick.
@@ -129,7 +131,7 @@ def _find_obstacle_of_chains(tables: SiteArrays) -> str:
 
 
 def find_structure(run: FusedRun) -> RunStructure:
-    """Returns the structure of a run.
+    """Returns the properties of a run that decide with which other runs it can be computed.
 
     Args:
         run: The run. There must be no obstacle, see `find_obstacle`.
@@ -159,7 +161,7 @@ def find_structure(run: FusedRun) -> RunStructure:
 
 
 def describe_structure(run: FusedRun) -> Hashable:
-    """Returns a value that is equal for runs which differ in numbers only.
+    """Returns a key for sorting runs into groups, equal for runs that differ in numbers only.
 
     Args:
         run: The run before its first tick.

@@ -1,13 +1,16 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Defines numbers of eight runs as one value, for functions whose loops cannot be turned.
+"""Lets a function that computes one run compute eight runs, by a vector type for its numbers.
 
-The recursions of a chain of joints are loops over the joints. A compiler that may choose the
-loop to use vectors for chooses these, which needs many single reads. Here a value of a function
-of the kernel is a vector with a number of each of eight runs instead. The loops over the joints
-stay as they are, and each operation is one instruction.
+A loop over runs becomes vector instructions if the loop over runs is the innermost one. In the
+dynamics of a chain of joints, the innermost loops go from joint to joint. The compiler would
+vectorise these, although their numbers are not adjacent in memory. Therefore this module
+defines a type of Numba for a value that consists of eight numbers, one for each run. In a
+function that is compiled for this type, `a + b` adds eight pairs of numbers by one instruction.
+The source of the function is not changed.
 
-A function that branches on such a value is refused when it is compiled. It must use `choose`.
+A function that branches on such a value is refused when it is compiled, because the eight runs
+may disagree. It must use `choose` instead.
 
 Invariant:
     - Each number of a result depends on the same numbers, by the same operations, as in a run
@@ -50,7 +53,7 @@ _LLVM_KINDS = {
 
 
 class LaneVector(types.Type):
-    """Numba's type of a number of eight runs.
+    """Numba's type of eight numbers, one for each of eight runs, in one vector register.
 
     Args:
         kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.
@@ -68,12 +71,12 @@ class LaneVector(types.Type):
         return "LaneVector", (self.kind,)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """A number that is equal in all runs can stand for a vector of floats."""
+        """Lets Numba use one number, equal in all runs, where eight floats are needed."""
         is_number = isinstance(other, types.Float | types.Integer)
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """A variable that is a vector in one branch, and a number in another, is a vector."""
+        """Makes a variable a vector if one branch assigns a vector and another a number."""
         is_number = isinstance(other, types.Float | types.Integer)
         return self if is_number and self.kind == "f8" else None
 
@@ -85,14 +88,14 @@ CONDITIONS = LaneVector("b1")
 
 @register_model(LaneVector)
 class _VectorModel(models.PrimitiveModel):
-    """A vector is represented by a vector of LLVM."""
+    """Represents a `LaneVector` in machine code by a vector of LLVM."""
 
     def __init__(self, manager: Any, numba_type: LaneVector) -> None:
         super().__init__(manager, numba_type, _LLVM_KINDS[numba_type.kind])
 
 
 def _repeat(builder: Any, number: Any, vector_type: Any) -> Any:
-    """Generates a vector of equal numbers."""
+    """Generates LLVM code for a vector of equal numbers."""
     undefined = ir.Constant(vector_type, ir.Undefined)
     first = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
     places = ir.Constant(ir.VectorType(ir.IntType(32), GROUP), [0] * GROUP)
@@ -100,7 +103,7 @@ def _repeat(builder: Any, number: Any, vector_type: Any) -> Any:
 
 
 def _cast_number(context: Any, builder: Any, source: Any, _target: Any, number: Any) -> Any:
-    """Generates the conversion of a number to a vector of floats."""
+    """Generates LLVM code for the conversion of a number to a vector of floats."""
     as_float = context.cast(builder, number, source, types.float64)
     return _repeat(builder, as_float, _LLVM_KINDS["f8"])
 
@@ -114,7 +117,7 @@ def _is_number(numba_type: Any) -> bool:
 
 
 def _define_binary(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
-    """Defines an operation on two vectors of floats, or on one of them and a number."""
+    """Tells Numba how to compute an operation such as `+` on one or two vectors."""
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -131,7 +134,7 @@ def _define_binary(function: Any, result: LaneVector, generate: Callable[..., An
 
 
 def _define_unary(function: Any, generate: Callable[..., Any]) -> None:
-    """Defines an operation on a vector of floats."""
+    """Tells Numba how to compute an operation on a vector of floats."""
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -144,7 +147,7 @@ def _define_unary(function: Any, generate: Callable[..., Any]) -> None:
 
 
 def _call_llvm(name: str) -> Callable[..., Any]:
-    """Returns a generator of the call of a function of LLVM."""
+    """Returns a function that generates the call of an LLVM function, such as sqrt."""
 
     def generate(builder: Any, number: Any) -> Any:
         floats = _LLVM_KINDS["f8"]
@@ -157,7 +160,7 @@ def _call_llvm(name: str) -> Callable[..., Any]:
 
 
 def _compare(symbol: str) -> Callable[..., Any]:
-    """Returns a generator of a comparison, which is false for NaN."""
+    """Returns a function that generates a comparison of two vectors, which is false for NaN."""
     return lambda builder, a, b: builder.fcmp_ordered(symbol, a, b)
 
 
@@ -200,7 +203,7 @@ _define_unary(np.floor, _call_llvm("llvm.floor"))
 
 
 def _define_integers(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
-    """Defines an operation on a vector of integers and an integer."""
+    """Tells Numba how to compute an operation on a vector of integers and an integer."""
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -222,7 +225,7 @@ _define_integers(operator.ne, CONDITIONS, lambda builder, a, b: builder.icmp_sig
 
 @intrinsic
 def _select(_context: Any, condition: Any, if_true: Any, if_false: Any) -> Any:
-    """Generates the choice between two vectors of floats by a vector of conditions."""
+    """Generates LLVM code that chooses between two vectors by eight conditions."""
     if condition != CONDITIONS:
         return None
     if not all(kind == FLOATS or _is_number(kind) for kind in (if_true, if_false)):
@@ -236,7 +239,7 @@ def _select(_context: Any, condition: Any, if_true: Any, if_false: Any) -> Any:
 
 @intrinsic
 def _truncate(_context: Any, number: Any) -> Any:
-    """Generates the conversion of floats to integers."""
+    """Generates LLVM code for the conversion of floats to integers."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.fptosi(args[0], _LLVM_KINDS["i8"])
@@ -249,12 +252,12 @@ truncate_vector: Any = _truncate
 
 
 def _choose_vector(condition: Any, if_true: Any, if_false: Any) -> Any:
-    """Form of `choose` for vectors."""
+    """Version of `choose` for vectors."""
     return select_vector(condition, if_true, if_false)
 
 
 def _whole_vector(number: Any) -> Any:
-    """Form of `whole` for vectors."""
+    """Version of `whole` for vectors."""
     return truncate_vector(number)
 
 
@@ -262,7 +265,7 @@ set_lane_form(choose, lambda _types: _choose_vector)
 
 
 def _round_vector_down(number: Any) -> Any:
-    """Form of `round_down` for vectors."""
+    """Version of `round_down` for vectors."""
     return np.floor(number)
 
 
@@ -271,7 +274,7 @@ set_lane_form(whole, lambda _types: _whole_vector)
 
 
 class _GroupType(types.Type):
-    """Type of rows of a table in eight lanes, a pointer to the first number."""
+    """Numba's type of some rows of a `LaneTable` in eight lanes: a pointer."""
 
     in_lanes = True
 
@@ -290,38 +293,38 @@ class _GroupType(types.Type):
 
 
 class RowsInGroup(_GroupType):
-    """Type of all rows of a table in eight lanes."""
+    """Numba's type of all rows that belong to eight adjacent lanes."""
 
 
 class RowInGroup(_GroupType):
-    """Type of one row of a table in eight lanes."""
+    """Numba's type of one row in eight adjacent lanes, whose numbers are `LaneVector`."""
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the field of a name, or None."""
+        """Returns the field with this name, or None if the row has none."""
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is equal in all lanes, or None."""
+        """Returns the value of a field if it is the same in all lanes, else None."""
         return dict(self.constants[0]).get(name)
 
 
 @register_model(RowsInGroup)
 @register_model(RowInGroup)
 class _GroupModel(models.PrimitiveModel):
-    """Rows in a group are represented by a pointer."""
+    """Represents rows in eight lanes in machine code by a pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
 
 
 def _vector_of(field: LaneField) -> LaneVector:
-    """Returns the type of a number of a field."""
+    """Returns the `LaneVector` for the numbers of a field."""
     return FLOATS if field.kind == "f8" else INTEGERS
 
 
 @infer_getattr
 class _RowAttributes(AttributeTemplate):
-    """Types of the fields of a row in a group."""
+    """Tells Numba the type of `row.field` for a row in eight lanes."""
 
     key = RowInGroup
 
@@ -339,7 +342,7 @@ class _RowAttributes(AttributeTemplate):
 
 @infer_getattr
 class _RowsAttributes(AttributeTemplate):
-    """Rows in a group have the shape (count,)."""
+    """Tells Numba the type of `rows.shape`, which is (count,), for rows in eight lanes."""
 
     key = RowsInGroup
 
@@ -348,14 +351,14 @@ class _RowsAttributes(AttributeTemplate):
 
 
 def _find_numbers(builder: Any, pointer: Any, field: LaneField) -> Any:
-    """Generates the address of the first vector of a field."""
+    """Generates LLVM code for the address of the first vector of a field."""
     numbers = offset_rows(builder, pointer, field.first_word)
     return builder.bitcast(numbers, _LLVM_KINDS[_vector_of(field).kind].as_pointer())
 
 
 @lower_getattr_generic(RowInGroup)
 def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name: str) -> Any:
-    """Generates the reading of a field: a constant, a vector, or a view of an array."""
+    """Generates LLVM code for reading `row.field`: a constant, a vector or an array."""
     constant = row_type.find_constant(name)
     if constant is not None:
         return context.get_constant(types.int64, constant)
@@ -390,7 +393,7 @@ def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name
 
 @lower_setattr_generic(RowInGroup)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Generates the writing of a vector."""
+    """Generates LLVM code for writing a vector to `row.field`."""
     row_type, value_type = sig.args
     field = row_type.find_field(name)
     value = context.cast(builder, args[1], value_type, _vector_of(field))
@@ -399,14 +402,14 @@ def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> 
 
 @lower_getattr_generic(RowsInGroup)
 def _read_shape(context: Any, builder: Any, rows: RowsInGroup, _value: Any, _name: str) -> Any:
-    """Generates the shape of rows in a group, which is a constant."""
+    """Generates LLVM code for `rows.shape` of rows in eight lanes, which is a constant."""
     count = context.get_constant(types.intp, len(rows.constants))
     return context.make_tuple(builder, types.UniTuple(types.intp, 1), [count])
 
 
 @infer_global(operator.getitem)
 class _RowsItem(AbstractTemplate):
-    """The type of `rows[index]`, if all rows have the same constants."""
+    """Tells Numba the type of `rows[index]`, if all rows have the same constants."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
@@ -419,7 +422,7 @@ class _RowsItem(AbstractTemplate):
 
 @lower_builtin(operator.getitem, RowsInGroup, types.Integer)
 def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Generates `rows[index]`."""
+    """Generates LLVM code for `rows[index]`."""
     row_bytes = ir.Constant(args[1].type, sig.args[0].row_length * LANES * _WORD)
     offset = builder.mul(args[1], row_bytes)
     return builder.gep(args[0], [offset], source_etype=ir.IntType(8))
@@ -427,7 +430,7 @@ def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @intrinsic
 def _in_group(_context: Any, table: Any, _group: Any) -> Any:
-    """Generates the rows of a table in eight lanes."""
+    """Generates LLVM code for the rows of an array that belong to eight adjacent lanes."""
     assert isinstance(table, LaneTable)
     rows_type = RowsInGroup(table, table.constants)
 

@@ -1,4 +1,11 @@
-"""Advances many runs, side by side in lanes where that is possible, and else one by one.
+"""Simulates many runs as fast as possible: together with vector instructions, or one by one.
+
+Parameter sweeps and tuning call `group_runs` with all their runs. Runs with equal structure
+form groups, which are computed in lanes of the vector registers. All other runs are computed
+alone. The caller need not know which runs were computed together:
+
+    for group in group_runs(runs):
+        group.advance_to(10.0)
 
 Invariant:
     - The numbers of a run do not depend on the other runs.
@@ -25,7 +32,7 @@ site tick.
 
 
 class RunGroup:
-    """Some runs that are advanced together.
+    """Some runs that are simulated together: with vector instructions, or one after the other.
 
     Args:
         members: Indices of the runs in the sequence that was divided into groups.
@@ -72,7 +79,7 @@ class RunGroup:
             run.advance_to(until_s)
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Removes all runs but some from the group.
+        """Continues with some of the runs only, so that no time is spent on the others.
 
         Args:
             chosen: Places in `members` of the runs to keep, in rising order. No arm of these
@@ -87,7 +94,7 @@ class RunGroup:
 def prepare_lanes(
     scenario: Scenario, runs: int, least_site_ticks: int = LANE_SITE_TICKS
 ) -> bool:
-    """Decides whether runs are computed in lanes, and compiles the code in this case.
+    """Decides whether a study computes its runs together, and compiles the code in this case.
 
     Lanes are used if the runs are long enough for the compilation, or if the code exists.
 
@@ -109,7 +116,10 @@ def prepare_lanes(
 
 
 def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGroup]:
-    """Divides runs into groups that can be advanced together.
+    """Divides runs into groups, each of which can be simulated together.
+
+    Runs that differ in numbers only, such as gains, come into the same group. A run that must
+    be computed alone gets a group of its own.
 
     Args:
         runs: The runs before their first tick.

@@ -1,7 +1,9 @@
-"""Advances a run and its twins side by side in lanes.
+"""Simulates a run together with its twins, copies of the run that start slightly displaced.
 
-A twin is a repetition of a run that receives a small push. All of them receive the same samples
-at the same ticks, which are therefore determined only once.
+The distance between a run and its twins shows whether small disturbances grow (`twins`). The
+run and the twins are computed at once, each in one lane of the vector registers. All of them
+receive the same samples (states of the other arms) at the same times, so the deliveries of the
+simulated network are computed once for all.
 
 Invariant:
     - The states and the records are those of `FusedRun`, bit for bit, as long as no arm leaves
@@ -24,11 +26,18 @@ from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
-    """A run in lanes cannot continue, because an arm left its limits or a law failed."""
+    """Error if a run and its twins cannot continue in lanes.
+
+    An arm left its limits, or a control law failed. The caller then repeats the runs one by
+    one.
+    """
 
 
 def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> bool:
-    """Returns True if a run and its twins are to be computed in lanes.
+    """Returns True if a run and its twins are computed faster together than one by one.
+
+    This requires that lanes support the run, and that the runs are long enough for the
+    compilation of the code, unless the code exists.
 
     Args:
         run: The run before its first tick.
@@ -43,7 +52,7 @@ def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> 
 
 
 class TwinLanes(LaneRun):
-    """A run and its twins in lanes. The run is in lane 0.
+    """A run and its twins (slightly displaced copies), each in a lane. The run is in lane 0.
 
     Args:
         run: The run before its first tick, which does not advance. See `suits_twins`.
@@ -93,7 +102,7 @@ class TwinLanes(LaneRun):
             raise LaneEndedError
 
     def _use_samples(self, first: int, count: int) -> int:
-        """Finds the samples that all runs use in a block of ticks."""
+        """Computes which samples the runs use in a block of ticks: all use the same."""
         if self._feed.first.shape[2] == 0:
             age = super()._use_samples(first, count)
         else:
@@ -139,7 +148,7 @@ class TwinLanes(LaneRun):
 
 
 class LaneTwin:
-    """One run in the lanes of a run and its twins, with the methods of `FusedRun` for twins.
+    """One of the runs in `TwinLanes`, with those methods of `FusedRun` that twins need.
 
     Args:
         lanes: The run and its twins.
@@ -187,7 +196,7 @@ class LaneTwin:
         return float(np.abs(difference).max())
 
     def _find_columns(self, field: str) -> slice:
-        """Returns the words of a field in the row of a site."""
+        """Returns the indices of a field's numbers among all numbers of a site's row."""
         fields: Any = self._lanes._layout.site.fields
         dtype, offset, *_ = fields[field]
         return slice(offset // 8, (offset + dtype.itemsize) // 8)

@@ -1,10 +1,11 @@
-"""Defines what all delay models have in common: loss, duplicates, outages and order of samples.
+"""Defines what the delay models of all network links have in common: loss, duplicates, outages.
 
-A site is a process that runs one arm. A link is the directed network connection between two
-sites. Its delay model computes the delay of each sample, the state that a site sends in one
-period of its control loop. A model is one class in a file of this folder, and is found by its
-file; there is no list of models. Models that the simulation kernel computes itself name a
-`DelayKind`. Any other model has a function of its own, which is compiled.
+A link carries the state of one arm to another arm. Its delay model computes how long each
+message takes, for example "uniform between 10 ms and 20 ms". Each model is one class in a file
+of this folder. There is no list of models: to add one, add a file.
+
+A model that the simulation kernel computes itself names a `DelayKind`. Any other model has a
+function of its own, which is compiled.
 
 Invariant:
     - Each model states the mean and the standard deviation of its delay in closed form. The

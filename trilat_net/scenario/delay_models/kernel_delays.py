@@ -1,14 +1,14 @@
 """Defines the network delay models that the simulation kernel computes itself.
 
-The kernel is the compiled code that advances a simulation. A scenario, the description of an
-experiment, gives the delay of each network link as a table of keys. Each class of this module
-represents one kind of table. It translates the keys to the parameters of a probability
-distribution or of a function of time, and states the mean and the standard deviation of the
-delay.
+The author of an experiment gives the delay of each network link as a table, for example with a
+mean and a jitter. Each class of this module represents one kind of table. It translates the
+keys to the parameters of a probability distribution or of a function of time, and states the
+mean and the standard deviation of the delay.
 
 Invariant:
-    - Each model names the `DelayKind` by which the kernel knows it. The kernel draws delays
-      from exactly the distribution whose mean and standard deviation the model states.
+    - Each model names the `DelayKind` by which the kernel, the compiled simulation, knows it.
+      The kernel draws delays from exactly the distribution whose mean and standard deviation
+      the model states.
 """
 
 import math

@@ -1,10 +1,12 @@
-"""Defines what operators and environments have in common, and completes their tables.
+"""Defines what all models of operators and environments have in common.
 
-An operator is a person or program who moves an arm; an environment is a wall or another body
-that acts on it. Each kind is one class in a file of this folder, and is found by its file;
-there is no list of kinds. Its name in a scenario is the tag of the class. Kinds that the
-simulation kernel computes itself name a `TorqueKind`. Any other kind has two functions of its
-own: `act`, which is compiled, and `effort`, which evaluates many rows at once.
+An operator is a human or a program that moves an arm. An environment is a wall or another body
+that acts on the arm. Each kind is one class in a file of this folder. There is no list of
+kinds: to add one, add a file. Its name in a scenario, the description of an experiment, is the
+tag of the class.
+
+Kinds that the simulation kernel computes itself name a `TorqueKind`. Any other kind has two
+functions of its own: `act`, which is compiled, and `effort`, which evaluates many rows at once.
 
 Invariant:
     - Torques and forces are those that act ON the arm. Times are seconds after the epoch, the

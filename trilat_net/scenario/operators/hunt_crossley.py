@@ -1,8 +1,9 @@
-"""Models a compliant body, such as tissue, into which the end effector presses.
+"""Models a soft body, such as tissue, into which the end effector of an arm presses.
 
 The contact force has an elastic part, which grows with the depth, and a damping part, which
 grows with the depth and with the speed of pressing (the model of Hunt and Crossley, 1975).
-Therefore the force begins and ends at zero, without a jump at contact.
+Therefore the force begins and ends at zero. A spring with a constant damper would make the
+force jump at contact.
 """
 
 import math

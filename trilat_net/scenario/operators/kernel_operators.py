@@ -1,11 +1,11 @@
 """Defines the operators and environments that the compiled simulation computes itself.
 
-An operator is a person or program who moves an arm, or a model of a person. An environment is a
-wall or another body that the arm touches. Each class here stores the settings of one kind, such
-as a spring towards a moving target, a recorded torque or a wall. It converts them to a
-`TorqueSource`, a record from which the compiled simulation computes the torque on the arm. The
-`TorqueKind` in this record selects the formula, and the documentation of `TorqueSource` states
-the meaning of its numbers for each kind.
+An operator is a human or a program that moves an arm. An environment is a wall or another body
+that the arm touches. Each class stores the settings of one kind, such as a spring towards a
+moving target, a recorded torque or a wall. It converts them to a `TorqueSource`, a record from
+which the compiled simulation computes the torque on the arm. The `TorqueKind` in this record
+selects the formula, and the documentation of `TorqueSource` states the meaning of its numbers
+for each kind.
 
 Invariant:
     - If the author of an experiment states no start for an operator, the operator holds the arm

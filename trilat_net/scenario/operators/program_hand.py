@@ -1,10 +1,11 @@
-"""Runs a program of a user as the operator of an arm.
+"""Lets a user's program act as the operator of an arm, for example a learned policy.
 
-An operator moves an arm by hand. Here a user's program takes the place of the hand: it is
-called at a fixed rate, and its actions apply in the ticks, the periods of the control loop. In
-a scenario, the description of an experiment, the program is named by its class:
-`{ kind = "own", class = "my_policy:Reach" }`. `ProgramHand` is the table in the scenario, and
-`HandPlayer` calls the program at a site, the process that runs one arm.
+The author of an experiment names the class of the program in the scenario:
+
+    { kind = "own", class = "my_policy:Reach" }
+
+`ProgramHand` stores this table, and `HandPlayer` calls the program at a fixed rate during the
+run. Its actions apply in the control periods of the arm.
 
 Invariant:
     - Naming the class does not run any of its code.
