@@ -1,14 +1,16 @@
-"""Traces the weights with which arms follow each other, and computes their energy weights.
+"""Computes the weights with which arms follow each other over a run, and their energy weights.
 
-A site is the process that runs one arm. The dominance factor alpha_ij is the weight with which
-site i follows the motion of site j. The factors may change during a run, at once or in a ramp.
+A slave may follow two masters, for example with weights 0.7 and 0.3, and these weights may
+change during the run, at once or in a ramp. The weight with which arm i follows arm j is called
+the dominance factor alpha_ij. Analyses need the factors at every time, which `DominanceHistory`
+gives.
 
-The stability proof uses the sum of the energies of all sites, in which site i has the weight
+The stability proof uses a weighted sum of the energies of all arms. The weight of arm i is
 
     beta_i = pi_i / c_i
 
 Here pi is the left eigenvector of the matrix alpha for the eigenvalue 1 (the Perron vector),
-and c_i is the factor by which the damping gain of site i differs from that of the first site.
+and c_i is the factor by which the damping gain of arm i differs from that of the first arm.
 Without these weights the proof does not hold (docs/theory/errata-proof.md).
 
 Invariant:

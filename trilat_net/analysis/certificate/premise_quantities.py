@@ -1,8 +1,10 @@
-"""The quantities by which the conditions of the stability theorem are judged, one class each.
+"""Defines the numbers and names that show whether a condition of the stability theorem holds.
 
-A site is the process that runs one arm, and the sites follow each other. A condition of the
-theorem is called a premise. `premises` and `observed_energy` compute the quantities from the
-log of a run. The package `presentation` writes the sentences about them.
+A condition of the theorem is called a premise. For example, the premise "the delays are
+constant" is judged by `DelayQuantities`, which has the delays of the network links. `premises`
+and `observed_energy` compute these classes from the log of a run. The package `presentation`
+writes the sentences about them, so that a sentence can be changed without touching the
+analysis.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.

@@ -1,13 +1,14 @@
-"""The facts from which a stability certificate judges the energy function V, without sentences.
+"""Defines the possible findings about the energy function V of a run, one class each.
 
-V is the energy function of the stability proof. A site is the process that runs one arm.
-`stability_certificate` finds the facts, and the package `presentation` writes the sentences
-about them.
+V is the energy function of the stability proof, which must not rise by itself. For example,
+`FunctionalRise` says when V rose and by how much, and `NoFunctional` for which arms V does not
+exist. `stability_certificate` selects the finding, and the package `presentation` writes the
+sentence about it.
 
 Invariant:
-    - The facts contain only names and numbers, no sentence.
-    - Each verdict has exactly one class of facts. An empty collection means that nothing of
-      this kind was found in the run.
+    - A finding contains only names and numbers, no sentence.
+    - Each verdict has exactly one finding. An empty collection means that nothing of this kind
+      was found in the run.
 """
 
 from enum import Enum, auto

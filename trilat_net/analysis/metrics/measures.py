@@ -1,9 +1,9 @@
-"""Registers the metrics of recorded runs, so that tables and commands find them by name.
+"""Lets a function register itself as a metric, so that tables and commands find it by name.
 
 A metric is a number that describes a run or a part of it, for example the RMS error of an arm.
-Each file of this folder contains functions that compute such numbers. The decorator `measures`
-registers a function together with the quantities that it returns. A subject is what a number
-describes: the run, a site (the process that runs one arm), a link or a wall.
+Each module of this folder contains functions that compute such numbers. The decorator
+`measures` registers a function together with the quantities that it returns (their names, units
+and meanings). A new metric therefore needs no change of the commands that print metrics.
 
 Invariant:
     - A value is a finite number, or None with a reason.

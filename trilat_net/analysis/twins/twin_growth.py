@@ -1,23 +1,23 @@
 """Measures whether small disturbances of a run grow or die away, by repeating the run.
 
-A twin is a repetition of a run that receives a small push, for example of one joint. Without
-the push, it would be identical to the run. The effect of the push is measured by the
-differences d of the joint velocities between the twin and the run, 20 times per second. Their
-amplitude A is
+A repetition of the run that receives a small push, for example of one joint, is called a twin.
+Without the push, it would be identical to the run. 20 times per second, the differences d of
+the joint velocities between the twin and the run are computed. The size of the disturbance is
+their amplitude A, with
 
     A^2 = sum over joints of d^2 + (a / w)^2
 
 Here a is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts are
 equal on average. If d is an oscillation that grows or decays with a certain rate, A does not
-oscillate, but is proportional to exp(rate t) over the time t. The rate is the slope of log A
-over the part of the run that is judged. `envelope_trend` defines the bounds of the slope, and
-the classes such as "grows" and "decays".
+oscillate, but is proportional to exp(rate t) over the time t. The rate is therefore the slope
+of log A over the part of the run that is judged. `envelope_trend` defines the bounds of the
+slope, and the classes such as "grows" and "decays".
 
 Invariant:
     - Velocities are compared. If a push merely shifts all arms to another position of rest, the
       difference becomes zero.
-    - A scenario may contain several groups of arms that do not follow each other. Each group is
-      judged separately, so that growth in one group is not hidden by another group.
+    - In a scenario whose arms form groups that do not follow each other, each group is judged
+      separately, so that growth in one group is not hidden by another group.
 """
 
 import math
