@@ -1,7 +1,11 @@
-"""Finds the messages in an unpacked chunk of an MCAP file, and copies their payloads.
+"""Finds all messages in an unpacked chunk of an MCAP file, in one pass of compiled code.
+
+A chunk is a block of a log that is compressed as a whole, and contains hundreds of messages of
+all channels. `walk_messages` finds where each message lies, and `copy_payloads` collects the
+messages of each channel.
 
 Invariant:
-    - The walk stops before everything but a complete message of a known channel, or a record
+    - The pass stops before everything but a complete message of a known channel, or a record
       that a reader ignores. The caller reads the rest as it reads any other file.
 """
 

@@ -1,4 +1,8 @@
-"""Stores the encoded messages of a channel one after another in one block of bytes."""
+"""Stores the encoded messages of a channel one after another in one block of bytes.
+
+Compiled code can read the block without creating a Python object for each message. For all
+other code it behaves like a list of `bytes`.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, overload

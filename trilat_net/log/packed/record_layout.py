@@ -1,8 +1,9 @@
 """Describes the exact bytes of a record as this program writes it, for compiled code.
 
-A record is the encoded result of one tick of a site, see `net.wire.encode_state`. Its fields
-have a fixed order. Between two values there are always the same bytes, such as the name of the
-next field. These bytes are called a literal.
+A record is the encoded state of an arm in one period of its control loop
+(`net.wire.encode_state`). Its fields have a fixed order, and the bytes between two values are
+always the same, such as the name of the next field. These constant bytes are called literals.
+By comparing them, `record_scan` recognises a record without a general decoder.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,8 @@
-"""Checks encoded records against the exact layout, and finds the places of their values.
+"""Checks whether encoded records have the exact layout, and finds where their values lie.
+
+A record is the encoded state of an arm in one period of its control loop. Once the places of
+the values are known, a field of all records can be read directly from the bytes
+(`indexed_records`).
 
 Invariant:
     - A record is accepted only if the decoder of whole records accepts it too, with the same
