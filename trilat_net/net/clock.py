@@ -1,9 +1,11 @@
 """Provides the clocks that all other modules use to read the time and to sleep.
 
-No other module reads a clock of the operating system. Code that needs the time receives a
-`Clock` as an argument (law L1 of docs/develop/design.md), so that tests and simulations can use
-a clock of their own. Times are integers in ns, because floating-point numbers would lose
-precision after a few months.
+Code that needs the time receives a `Clock` as an argument, so that tests and simulations can
+use a clock of their own, for example one that drifts (law L1 of docs/develop/design.md). Times
+are integers in ns, because floating-point numbers would lose precision after a few months.
+
+Invariant:
+    - No other module reads a clock of the operating system.
 """
 
 import platform

@@ -1,6 +1,7 @@
-"""Estimates the offset and drift between two clocks from the time stamps of messages.
+"""Estimates the offset and drift between the clocks of two machines from message time stamps.
 
-A message cannot be received before it was sent. With
+Delays between two machines can be measured only if the offset between their clocks is known. A
+message cannot be received before it was sent. With
 
     offset = other clock - local clock,
 
@@ -27,8 +28,8 @@ Invariant:
     - The time stamps prove each error bound, however long the delays are, and however different
       they are in the two directions. No symmetry of the network is assumed.
     - Delays are computed with a smoothed offset (`SlewedOffset`) that never steps, because a
-      step would appear as a jump of all delays. The smoothed offset is continuous and piecewise
-      linear. It reaches each new estimate within SLEW_NS, and then follows the estimated drift.
+      step would appear as a jump of all delays. The smoothed offset reaches each new estimate
+      within SLEW_NS, and then follows the estimated drift.
     - The error bound of the smoothed offset is also valid while the offset still approaches a
       new estimate.
 """
