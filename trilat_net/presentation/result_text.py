@@ -1,8 +1,7 @@
 """Represents the text of a result as blocks, for the terminal, plain text and HTML.
 
-A result is what a command has computed, such as the measured numbers of a run. Its text
-consists of blocks. A block is a line, a line that begins with a mark such as a green "ok"
-(`MarkedText`), or a table (`TextTable`).
+The text of a result consists of blocks. A block is a line, a line that begins with a mark such
+as a green "ok" (`MarkedText`), or a table (`TextTable`).
 
 A class of results may have a method `blocks` that returns its blocks. For other classes, a
 function in this folder composes the blocks, and `_COMPOSERS` lists these functions by the name
