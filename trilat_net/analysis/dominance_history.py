@@ -145,11 +145,11 @@ def find_users(scenario: Scenario) -> tuple[str, list[str]]:
 
 
 class UserShares(NamedTuple):
-    """How a slave divides its motion between its users, at K times.
+    """How much of a slave's motion each of its users determines, at K times.
 
-    A slave follows the master of each user with a weight, the dominance factor. In some
-    experiments a program moves the arm of one user. While another user leads, a person
-    intervenes.
+    The slave follows the master of each user with a weight, the dominance factor. For example,
+    shares of 0.7 and 0.3 mean that the first user leads. In some experiments a program moves
+    the arm of one user. While another user leads, a person intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
@@ -484,7 +484,8 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
     """Finds the groups of sites that follow each other, and that follow nobody else.
 
     A site is the process that runs one arm. It may follow another site directly or through
-    further sites.
+    further sites. If there are several groups, the weights of the sites in the energy function
+    V are not unique.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

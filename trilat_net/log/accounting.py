@@ -517,7 +517,7 @@ MIN_COVERAGE = 0.999
 
 
 class Coverage(NamedTuple):
-    """States for each site which part of a run was recorded, or checked by a tool.
+    """What part of a run was recorded, or checked by a tool, for each site.
 
     A site is a process that runs one arm. A tick is one period of its control loop.
 

@@ -48,7 +48,7 @@ InnerRecord = tuple[int, bytes]
 
 
 class TornChunk(NamedTuple):
-    """A compressed block of messages (chunk) that reaches beyond the end of its file.
+    """A compressed block of messages (chunk) whose end is missing from its file.
 
     This happens when a recording is interrupted. The messages in the existing part can still be
     recovered.

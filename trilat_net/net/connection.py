@@ -160,7 +160,7 @@ RETRY_NS = 200_000_000
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """How a process connects to the network: endpoints, mode and keys.
+    """How a process connects to the network of a session: endpoints, mode and keys.
 
     Attributes:
         listen: Endpoints at which the process listens.

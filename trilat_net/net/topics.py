@@ -55,10 +55,10 @@ STATS_PER_SECOND = 10
 
 
 class KeyParts(NamedTuple):
-    """Parts of a key.
+    """The parts of a key, the text under which a message is published.
 
-    A key is the text under which a message is published. A member is a process that takes part
-    in a session, and a channel is one stream of its messages.
+    The key trilat/<session>/<member>/<channel> names the session, the process that sends the
+    message (the member), and the stream of messages (the channel).
 
     Attributes:
         session: Name of the session.

@@ -65,9 +65,9 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns metrics without values for all quantities of a group, with a common reason.
+    """Returns metrics without values, with a common reason, for all quantities of one heading.
 
-    A function that measures a group returns them if, for example, a site has no records.
+    For example, a function that measures tracking returns them if an arm has no records.
 
     Args:
         group: Group of the quantities.

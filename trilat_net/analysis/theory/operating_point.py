@@ -95,7 +95,7 @@ class _EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The numbers from which the linear model of a loop is built.
+    """The gains, delays, weights and operators from which the linear model of a loop is built.
 
     They are those at the end of a run of the scenario, see `OperatingConditions.derive`. N is
     the number of sites.

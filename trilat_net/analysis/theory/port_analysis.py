@@ -179,7 +179,10 @@ class TwoPort(NamedTuple):
 
 
 class PortAnalysis(NamedTuple):
-    """Results of the analysis of a teleoperator's ports, see `analyse_ports`.
+    """What operators feel in coupled arms, and whether the arms are passive.
+
+    `analyse_ports` computes it. A port is the place where an operator or an environment touches
+    an arm, such as a joint.
 
     Attributes:
         scenario: The teleoperator.
@@ -228,7 +231,7 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The word for a port in texts: "joint", or "axis" for arms in task space."""
+        """Word for a port in tables and texts: "joint", or "axis" for arms in task space."""
         return "axis" if self.axes else "joint"
 
     @property

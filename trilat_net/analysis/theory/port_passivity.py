@@ -192,7 +192,7 @@ def check_against_hands(
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
-    """Scales the response at some ports, so that its passivity is judged with weights.
+    """Multiplies a frequency response by weights, so that its passivity is judged with them.
 
     The result is D^1/2 Y D^-1/2 with D = diag(weights). The eigenvalues of its Hermitian part
     have the same signs as those of D Y + Y^H D.
@@ -356,10 +356,10 @@ def llewellyn_rounding(Y: Complex) -> Array:
 
 
 def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
-    """Returns the admittance at some ports while the velocity of other ports is held at zero.
+    """Returns the admittance at some joints while other joints are clamped.
 
-    The admittance is the velocity per torque. The result is a Schur complement. At ports in
-    neither list no torque acts: they move freely.
+    The admittance is the velocity per torque, and a clamp holds the velocity at zero. The
+    result is a Schur complement. Joints in neither list move freely.
 
     Args:
         Y: Admittance at all ports, shape (F, p, p).

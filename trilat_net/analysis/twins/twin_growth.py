@@ -78,9 +78,9 @@ MOST_LOG = 700.0
 class PushGrowth(NamedTuple):
     """How the effect of one push developed over the judged part of a run.
 
-    A push is a small disturbance in a repetition of the run, called a twin. Its effect is the
-    difference between the twin and the run. If a run has several groups of sites that do not
-    follow each other, a push has one such object for each group.
+    A push is a small disturbance in a repetition of the run, which is called a twin. Its effect
+    is the difference between the twin and the run. If some arms of the scenario do not follow
+    the others, a push has one such object for each group of arms that follow each other.
 
     Attributes:
         push: The push: what was changed, when and by how much.
@@ -147,10 +147,10 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """Whether small pushes of a run grow or die away, computed by `judge_twins`.
+    """Whether small pushes grow or die away in repetitions of a run, computed by `judge_twins`.
 
-    Each push is made in a repeated run, called a twin. Its difference from the run is then
-    observed.
+    Each push is made in a repetition of its own, which is called a twin. The difference between
+    the twin and the run is then observed.
 
     Attributes:
         why: The reason why there are no twins. Empty if there are.
@@ -787,7 +787,9 @@ class _LinearSizes(NamedTuple):
 class PushedTwins(Result):
     """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
 
-    A push is a small disturbance in a repetition of the run, called a twin.
+    For example, a push changes the angle of one joint by a small amount, in a repetition of the
+    run that is called a twin. The result says whether the difference from the run grows or dies
+    away.
 
     Attributes:
         log: The log of the run.
