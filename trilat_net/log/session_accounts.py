@@ -1,8 +1,8 @@
 """Counts the received and missing messages of all channels of a session.
 
-`SessionAccounts` contains an `Account` for each channel whose messages have numbers. The events
-of the sites state which ticks exist: when a site began, which ticks it skipped, and when it
-ended.
+A channel contains the numbered messages of one kind and sender. `SessionAccounts` has an
+`Account` for each channel. It follows the events with which the arms state which control
+periods exist: when an arm began, which periods it skipped, and when it ended.
 
 Invariant:
     - To count the messages of a file, only the events are decoded.

@@ -1,10 +1,10 @@
 """Defines the signals that only figures and pages show, and reduces signals for plots.
 
-A signal is an array with a row for each record (the result of one tick of the arm's control
-loop). `analysis.site_signals` has the signals that metrics and summaries use too. For plots,
-the rows are reduced: each bucket of records keeps the minimum and the maximum of each column,
-so that a spike of a single tick at 1 kHz stays visible. A gap in the records that is wider than
-a bucket becomes a row of NaN, so that no line is drawn across it.
+A signal is an array with one row for each period of the control loop. A run of a minute at 1
+kHz has 60 000 rows, too many for a plot. Therefore the rows are reduced: each bucket of records
+keeps the minimum and the maximum of each column, so that a spike of a single period stays
+visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no line
+is drawn across it. `analysis.site_signals` has the signals that metrics and summaries use too.
 
 Invariant:
     - Empty logs give empty arrays.

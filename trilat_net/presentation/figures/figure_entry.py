@@ -1,7 +1,6 @@
-"""Registers the functions that draw figures of a log, each under a name.
+"""Lets a function register itself as a figure of a log, under a name.
 
-A log is the MCAP file with the results of a run. A module of this folder adds a figure by
-decorating a function:
+A module of this folder adds a figure by decorating a function:
 
     @draws("positions", "actual and desired angles", in_report=True)
     def draw_positions(log, form): ...
