@@ -69,7 +69,9 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """Requests the missing messages of one site from the site's buffer of recent messages.
+    """Requests the messages of one site that were lost on the network, from the site itself.
+
+    The site is the process that controls one arm, and keeps its recent messages in a buffer.
 
     Args:
         bus: Network connection of the recorder.

@@ -53,7 +53,7 @@ LAST_NS = 6_000_000_000
 
 
 class Recording:
-    """One log while it is recorded: writes messages, and counts received and missing ones.
+    """Writes one log while it is recorded, and counts its received and missing messages.
 
     `Recorder` creates this object when the session begins, and calls `write` periodically.
 

@@ -204,11 +204,10 @@ _BLOCK_BYTES = 1 << 12
 
 
 class McapReader:
-    """Reader of one MCAP file, from its beginning to its end.
+    """Reads one MCAP file from its beginning to its end, also if the file is damaged.
 
-    There are three ways of reading. `messages` yields the messages, and nothing else. `blocks`
-    yields them in blocks, which is much faster. `scan` yields the records and the damaged parts
-    of the file, as the scanner finds them, for the check and the recovery of damaged files;
+    `messages` yields the messages one by one, and `blocks` in blocks, which is much faster.
+    `scan` yields the records and the damaged parts of the file, for its check and its recovery.
     `read_record` yields the messages of a record.
 
     Args:
@@ -780,7 +779,7 @@ _FIRST_BYTES = 1 << 12
 
 
 class ChannelMessages:
-    """Messages of one topic as a log contains them, still encoded, in the order of the file.
+    """The messages of one topic in a log, still encoded, in the order of the file.
 
     Attributes:
         log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
@@ -874,7 +873,7 @@ def _clip_times(times: "array[int]") -> NDArray[np.int64]:
 
 @dataclass
 class LogContents:
-    """Contents of a log before its messages are decoded, from one file or from several parts.
+    """Everything in a log, from one file or several parts, before its messages are decoded.
 
     Attributes:
         sources: Names of the files.

@@ -39,9 +39,9 @@ _EVENTS_NUMBERED_SINCE = 3
 class SessionAccounts:
     """Counts the received and missing messages of all numbered channels of a session.
 
-    A recorder uses this class while it records, and the tools use it to count the messages of a
-    log. The caller passes every message. From the events, the class learns how many ticks the
-    sites executed.
+    A recorder uses this class while it records, and the check of a log counts with it later.
+    The caller passes every message. From the events, the class learns how many periods (ticks)
+    of its control loop each arm executed.
 
     Args:
         session: Name of the session.

@@ -260,7 +260,7 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Settings of one site for joining a session that is already running.
+    """Settings of one site: whether it may join a running session, and whom a start awaits.
 
     Attributes:
         may_join_late: True if this site may join a running session. The caller sets it only if

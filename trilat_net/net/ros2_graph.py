@@ -123,10 +123,9 @@ class QualityOfService(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """Attachment of every message, request and response.
+    """Sender, number and time of a message, which ROS 2 programs attach to every Zenoh message.
 
-    ROS 2 programs that communicate over Zenoh attach it, so that receivers can number and time
-    the messages of each sender.
+    Receivers can thus number and time the messages of each sender.
 
     Attributes:
         number: Number of the message, from 1.

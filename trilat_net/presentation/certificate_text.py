@@ -123,11 +123,11 @@ def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTa
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the text about the pushed twins of a run.
+    """Yields the text about repetitions of a run that received a small push.
 
-    A push is a small disturbance of a twin, a second execution of the run. It shows whether
-    disturbances grow. The text states up to which size a push has a proportional effect, and
-    has a line about each push.
+    A repetition with a push is called a twin, and shows whether small disturbances grow. The
+    text states up to which size a push has a proportional effect, and has a line about each
+    push.
 
     Args:
         twins: The run and its twins.
@@ -141,7 +141,7 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """A sentence of a stability certificate, marked with what it says about stability.
+    """A sentence of a stability certificate, with a mark such as "ok" or "FAIL".
 
     Attributes:
         mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against

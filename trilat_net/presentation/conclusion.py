@@ -39,7 +39,7 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """Everything that a user wants to know about a finished run, with the written files.
+    """The text and the files with which a finished run is presented to its user.
 
     `conclude` creates this object after a run was recorded.
 

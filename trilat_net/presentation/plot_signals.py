@@ -124,7 +124,7 @@ class _DecimatedTrace(NamedTuple):
 def extreme_rows(values: Array, buckets: int) -> Ints:
     """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
 
-    The rows are divided into intervals with equal numbers of rows (buckets). In each bucket the
+    The rows are divided into buckets, intervals with equal numbers of rows. In each bucket the
     rows with the largest and the smallest value of each column are kept. The first and the last
     row are kept as well. NaN is never an extreme. A bucket in which a column is NaN throughout
     keeps its first row.

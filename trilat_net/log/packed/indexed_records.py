@@ -42,9 +42,9 @@ _TICK, _BOOT, _MODE = range(3)
 
 
 class IndexedRecords:
-    """Records of a site that have the exact layout, with the places of their values.
+    """Fields of K records of an arm, which compiled code reads directly from the encoded bytes.
 
-    `index_records` creates this object. K is the number of records.
+    All records have the layout that this program writes. `index_records` creates this object.
 
     Args:
         messages: The encoded records.

@@ -20,7 +20,10 @@ message, and after the head of a number at its end.
 
 
 class PackedMessages(Sequence[bytes]):
-    """Read-only sequence of encoded messages, which are created as `bytes` when accessed.
+    """List of encoded messages that are stored in one block of bytes, and cannot be changed.
+
+    A message becomes a `bytes` object only when it is accessed, because thousands of objects
+    would take much memory and time.
 
     Args:
         data: The messages, followed by `PADDING` bytes.

@@ -31,10 +31,10 @@ BEFORE_BUSY, BEFORE_SENT, BEFORE_ECHO, FIRST_VECTOR = range(10, 14)
 
 
 class RecordLayout(NamedTuple):
-    """The literals of a record, and the lengths of its vectors, for compiled code.
+    """The constant bytes (literals) between the values of a record, and its vector lengths.
 
-    Each literal is stored as words of eight bytes. Only the bytes that the mask of a word
-    selects are part of the literal.
+    Compiled code compares a record with them. Each literal is stored as words of eight bytes.
+    Only the bytes that the mask of a word selects are part of the literal.
 
     Attributes:
         bits: Words of all literals, shape (W,).
@@ -74,7 +74,7 @@ def _map_head(length: int) -> bytes:
 
 
 def make_record_layout(site: str, peers: Sequence[str], layout: Layout) -> RecordLayout:
-    """Returns the exact layout of the records of a site.
+    """Describes the exact bytes of the records of one arm, as this program writes them.
 
     Args:
         site: Name of the site.
