@@ -91,7 +91,7 @@ CollectProvenance = Callable[[], Mapping[str, str]]
 
 
 class Recorder:
-    """Recorder of one session, from the search for its members to the end mark of the file.
+    """Runs one recording: joins the session, writes its messages, and completes the file.
 
     Args:
         bus: Network connection of the recorder.
@@ -345,7 +345,7 @@ def record_session(
     afterwards: Callable[[], None] = lambda: None,
     warn: Callable[[], None] = lambda: None,
 ) -> int:
-    """Records one session in this process.
+    """Records one session in this process, from its search on the network to the finished log.
 
     Args:
         session: Name of the session.

@@ -729,7 +729,7 @@ _ALL_GAPS = 600
 
 
 class RecorderReport:
-    """Publishes statistics of a recording once a second, such as its size and its gaps.
+    """Publishes statistics of a recording once a second, such as its size and missing messages.
 
     Args:
         bus: Network connection of the recorder.

@@ -188,10 +188,10 @@ class SiteMessage(NamedTuple):
 
 
 class SiteReception:
-    """Messages that were received from one start of a site, and the counts of missing messages.
+    """Received messages from one start of a site, and the counts of its missing messages.
 
-    If a site is started again, a new object is created, which continues the counts of the
-    previous one.
+    A site is the process that controls one arm. If it is started again, a new object is
+    created, which continues the counts of the previous one.
 
     Args:
         scenario: Scenario of the session.

@@ -283,7 +283,7 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """Statistics of a list of numbers, in the unit of the numbers.
+    """Mean, standard deviation, percentiles and extremes of some numbers, in their unit.
 
     Attributes:
         mean: Arithmetic mean.
@@ -721,7 +721,7 @@ def _count_samples(
 
 
 class DelayDistribution(NamedTuple):
-    """Delays and ages of the samples on one link.
+    """Delays and ages of all samples on one link, for a histogram.
 
     Attributes:
         peer: Name of the sender.

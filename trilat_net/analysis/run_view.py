@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """One site of a recorded run: its motion, its torques and whom it follows.
+    """One arm in a recorded run: its motion, its torques, and how it follows the other arms.
 
     Attributes:
         records: Records of the site, with one row for every tick.

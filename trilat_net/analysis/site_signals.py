@@ -62,7 +62,7 @@ def external_torques(part: SiteLog) -> Array:
 
 
 class JointError(NamedTuple):
-    """The largest error |e| among some records, with its place and time.
+    """The largest error |e| in some records, with the joint and the time at which it occurred.
 
     Attributes:
         value: The error, in the unit of the shared coordinates.

@@ -94,7 +94,7 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
 
 
 class ChannelInfo(NamedTuple):
-    """Describes a channel, a sequence of messages of one kind, as an MCAP file defines it.
+    """Description of a channel in an MCAP file, that is of a sequence of messages of one kind.
 
     Attributes:
         topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -115,7 +115,7 @@ class ChannelInfo(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """One message as an MCAP file contains it, still encoded.
+    """One message of an MCAP file, with its channel, times and number, still encoded.
 
     Attributes:
         topic: Topic of the channel. Empty if the file does not define the channel.

@@ -82,7 +82,7 @@ class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk, a block of compressed records, which describes these records.
+    """Header of a chunk, a compressed block of records: sizes, times and compression.
 
     Attributes:
         start_ns: Arrival time of the earliest message in the chunk, in ns.

@@ -455,7 +455,7 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Creates the object that counts the messages of a file, before they are read.
+    """Creates the counters of a session, before the messages of a file are read.
 
     Args:
         metadata: Metadata of the file, by name. They state the session.

@@ -55,7 +55,7 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The clocks of this machine, as the operating system provides them."""
+    """The clocks of the operating system of this machine."""
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
     """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""

@@ -106,7 +106,7 @@ def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
 
 
 def key(session: str, member: str, channel: str) -> str:
-    """Returns the key under which a member publishes the messages of one channel.
+    """Returns the network address (key) under which a process publishes one kind of messages.
 
     Args:
         session: Name of the session.

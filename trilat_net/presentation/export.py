@@ -34,7 +34,7 @@ Written = Callable[[int], None]
 
 
 class ExportFormat(NamedTuple):
-    """A format in which logs can be exported, such as CSV.
+    """A file format to which logs can be exported, such as CSV.
 
     It is the constant `FORMAT` of a module in the folder `exports`.
 

@@ -111,7 +111,7 @@ class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": 
 
 
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
-    """A chart of the page over the time of the run.
+    """A chart of the report over the time of the run, such as the joint angles.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.

@@ -39,7 +39,7 @@ MARKS["note"] = "note"
 
 
 class TextTable(NamedTuple):
-    """A table of texts, which can be rendered for a terminal, as Markdown or as HTML.
+    """A table of texts that can be printed, or rendered as Markdown or HTML.
 
     Attributes:
         headers: Header of each column. If all are empty, the table has no header line.
@@ -190,7 +190,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 
 class MarkedText(NamedTuple):
-    """A line of printed text behind a mark that states a result, such as a green "ok".
+    """A line of text that begins with its result as a mark, such as a green "ok".
 
     Attributes:
         mark: The mark in Rich's markup, as in "[green]ok[/green]". Empty for no mark.

@@ -135,7 +135,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels, parts of the figure with axes of their own.
+    """Adds a grid of panels (parts of the figure with axes of their own) to a figure.
 
     Args:
         figure: The Matplotlib figure.

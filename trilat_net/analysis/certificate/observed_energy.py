@@ -125,7 +125,10 @@ class _LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Verdict on the energies that control laws declare, computed by `ObservedEnergy.of_log`.
+    """Judgement of a run by the energies that its control laws declare.
+
+    `ObservedEnergy.of_log` computes it, and compares the energies with recorded torques and
+    motion.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.

@@ -212,7 +212,7 @@ class FollowingQuantities(NamedTuple):
 
 
 class CutTorque(NamedTuple):
-    """A site whose actuators could not deliver the torque that its control law demanded.
+    """A site whose motors could not deliver the torque that its control law demanded.
 
     Attributes:
         site: Name of the site.
@@ -239,7 +239,7 @@ class TorqueQuantities(NamedTuple):
 
 
 class TouchedStop(NamedTuple):
-    """A site whose arm ran into the mechanical stops of its joints.
+    """A site whose arm reached the mechanical end stops of its joints.
 
     Attributes:
         site: Name of the site.
@@ -293,7 +293,7 @@ class SingularPoseQuantities(NamedTuple):
 
 
 class Supply(NamedTuple):
-    """Energy that operators and environments supplied, and the motion without them at the end.
+    """Energy that operators and environments supplied, and how long nobody pushed at the end.
 
     Attributes:
         sources: Names of the sources.

@@ -24,7 +24,7 @@ from ..run_view import RunView
 
 
 class Metric(NamedTuple):
-    """The value of a quantity for one subject: a number, or the reason why there is none.
+    """The value of a metric for one arm, link, wall or run: a number, or why there is none.
 
     Attributes:
         value: The number, which is finite. None if there is none.
@@ -152,7 +152,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of some numbers, for metrics such as the peak torque.
+    """Returns the largest absolute value of some numbers, for example the peak torque.
 
     Args:
         values: The numbers, of any shape.
@@ -165,7 +165,9 @@ def peak(values: ArrayLike) -> float:
 
 
 class Quantity(NamedTuple):
-    """Definition of a number that a run, or each of its sites, links or walls has.
+    """Definition of a metric: its key, name and unit, and to what it applies.
+
+    For example, the RMS error has the unit rad and applies to each arm.
 
     Attributes:
         key: Key in programs. It ends in the unit, if there is any.

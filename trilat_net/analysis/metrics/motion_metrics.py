@@ -419,7 +419,7 @@ class _BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of the arm parameters theta that a site made during a run, shape (P,) each.
+    """Estimates of the arm's dynamic parameters theta during a run, shape (P,) each.
 
     Attributes:
         learnt: True for each parameter that the law adapts.

@@ -616,7 +616,9 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Computes the rightmost roots of a continuous loop, which decide its stability.
+    """Computes the rightmost characteristic roots of a loop with delays, in continuous time.
+
+    The loop is stable if all roots have a negative real part.
 
     Args:
         loop: The loop.

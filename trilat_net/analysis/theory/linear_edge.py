@@ -371,6 +371,8 @@ class _GrowthRate:
 class GrowthColumn(NamedTuple):
     """Growth rate of small motions of coupled arms, for several values of one setting.
 
+    A positive rate means that the arms are unstable at this value.
+
     Attributes:
         growth_per_s: Growth rate for each value, in 1/s, which is the real part of the
             rightmost characteristic root. It is NaN if the scenario cannot be linearised, and

@@ -93,7 +93,9 @@ class DelayedTerm(NamedTuple):
 
 
 class LinearLoop(NamedTuple):
-    """A linear loop with delays, in the notation of the module's docstring.
+    """Linear model of the coupled arms near a pose of rest, with network delays.
+
+    The module's docstring has the equation and the notation.
 
     Attributes:
         names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".

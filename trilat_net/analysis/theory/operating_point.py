@@ -52,7 +52,7 @@ from .site_dynamics import SiteRates, evaluate_site_rates
 
 
 class Equilibrium(NamedTuple):
-    """The pose about which a loop is linearised, with all sites at rest.
+    """The pose about which the coupled arms are linearised, with all arms at rest.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints end in zeros.

@@ -476,7 +476,7 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """Impedance that an operator feels along a joint, with another site free and clamped.
+    """Impedance that an operator feels at a joint, with another arm free and clamped.
 
     Attributes:
         operator_site: Site of the operator.

@@ -30,7 +30,7 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A figure that can be drawn from a log, as registered by the decorator `draws`.
+    """A figure that can be drawn from a log, with a description and a drawing function.
 
     Attributes:
         about: Description of the contents, for lists of figures.
