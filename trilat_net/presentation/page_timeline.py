@@ -1,8 +1,8 @@
 """Renders the section of a report that lists what happened in the run, in order of time.
 
-For example, a command changed the network delay at 5 s. Listed are commands that change the
-run, and changes of an arm's mode: it follows the other arms, holds its position, brakes or
-returns.
+For example, a command changed the network delay at 5 s, or an operator pushed an arm at 7 s.
+The section also lists alarms, and changes of an arm's mode: it follows the other arms, holds
+its position, brakes or returns.
 
 Invariant:
     - Every sentence comes from the scenario or from a record.
