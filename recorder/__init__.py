@@ -1,4 +1,9 @@
-"""Record the messages of a session in a log (`record_process`), and play logs (`play`)."""
+"""Records the messages of a running session in a log.
+
+The recorder is a process of its own (`record_process`), so that a slow disk cannot delay the
+control loops of the arms. It imports the network and the log, but neither the simulation, the
+control laws nor the scenarios.
+"""
 
 from typing import TYPE_CHECKING
 

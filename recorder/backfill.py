@@ -1,16 +1,15 @@
-"""Requests missing messages from a site, which keeps its recent messages in a buffer.
+"""Requests messages that were lost on the network from their sender, which keeps recent ones.
 
-A site is a process that runs one arm and publishes numbered messages. The recorder writes them
-to a log, and notices a missing message by a gap in the numbers. If the last messages of a site
-are missing, there is no gap. Therefore, if nothing arrives from a site for a while, the
-recorder requests its newest messages (a probe). No function waits: the present time is an
-argument.
+The process of each arm (the site) publishes numbered messages, and the recorder writes them to
+a log. A gap in the numbers shows that a message was lost. If the last messages are lost, there
+is no gap. Therefore, if nothing arrives from a site for a while, the recorder requests its
+newest messages (a probe). No function waits: the present time is an argument.
 
 Invariant:
     - At most one request to a site is open at a time.
     - No request for missing messages is sent if no message is missing.
     - A message that the site no longer has is not requested again.
-    - Messages from the buffer pass the same checks as published messages.
+    - Messages from the buffer of the site pass the same checks as published messages.
 """
 
 from collections import Counter
@@ -70,7 +69,9 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """Requests the missing messages of one site from the site's buffer of recent messages.
+    """Requests the messages of one site that were lost on the network, from the site itself.
+
+    The site is the process that controls one arm, and keeps its recent messages in a buffer.
 
     Args:
         bus: Network connection of the recorder.

@@ -1,8 +1,9 @@
-"""Runs the recorder as a process: joins a session, writes its messages, and ends with it.
+"""Runs the recorder: a process that joins a session, writes its messages, and ends with it.
 
-A session is a joint run of several sites, processes that control one arm each and publish
-messages on the network. The recorder writes these messages to a log. Each site keeps its recent
-messages in a buffer, from which the recorder requests those that it missed.
+The processes of a session, which each control one arm (the sites), publish the state of their
+arms, typically a thousand times per second. The recorder writes these messages to a log. Each
+site keeps its recent messages in a buffer, from which the recorder requests those that it
+missed.
 
 Invariant:
     - No message is lost that has arrived, or that a site still has in its buffer.
@@ -90,7 +91,7 @@ CollectProvenance = Callable[[], Mapping[str, str]]
 
 
 class Recorder:
-    """Recorder of one session, from the search for its members to the end mark of the file.
+    """Runs one recording: joins the session, writes its messages, and completes the file.
 
     Args:
         bus: Network connection of the recorder.
@@ -344,7 +345,7 @@ def record_session(
     afterwards: Callable[[], None] = lambda: None,
     warn: Callable[[], None] = lambda: None,
 ) -> int:
-    """Records one session in this process.
+    """Records one session in this process, from its search on the network to the finished log.
 
     Args:
         session: Name of the session.

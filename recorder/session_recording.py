@@ -1,9 +1,9 @@
 """Records one session: writes its messages, finds missing ones, and publishes statistics.
 
-A session consists of sites, processes that run one arm each. Each start of a site has a boot, a
-random number that identifies it. A site may be started again while the session runs. Its new
-start then continues the numbers of the records, the messages with the results of each period of
-the control loop.
+The messages come from sites, the processes that each run one arm. A site may be started again
+while the session runs. Each start has a boot, a random number that identifies it, and the new
+start continues the numbers of the records, the messages with the state of the arm in each
+period of its control loop.
 
 Invariant:
     - A message of the session is written once, byte for byte. Any other message is counted as
@@ -53,7 +53,7 @@ LAST_NS = 6_000_000_000
 
 
 class Recording:
-    """One log while it is recorded: writes messages, and counts received and missing ones.
+    """Writes one log while it is recorded, and counts its received and missing messages.
 
     `Recorder` creates this object when the session begins, and calls `write` periodically.
 
@@ -732,7 +732,7 @@ _ALL_GAPS = 600
 
 
 class RecorderReport:
-    """Publishes statistics of a recording once a second, such as its size and its gaps.
+    """Publishes statistics of a recording once a second, such as its size and missing messages.
 
     Args:
         bus: Network connection of the recorder.

@@ -1,8 +1,9 @@
-"""Receives the messages of a session, and finds out which messages are missing.
+"""Receives the messages of a session, checks them, and finds out which are missing.
 
-A site is a process that runs one robot arm. `InboundQueue` holds the messages between the
-threads of the network and the thread that writes the log. `SiteReception` decodes, checks and
-counts the messages of one site.
+The recorder must neither lose messages in a burst nor believe a faulty sender. `InboundQueue`
+holds the messages between the threads of the network and the thread that writes the log.
+`SiteReception` decodes, checks and counts the messages of one site, the process that runs one
+arm.
 
 Invariant:
     - The queue is bounded in messages and in bytes. The bytes of each sender's channel are
@@ -187,10 +188,10 @@ class SiteMessage(NamedTuple):
 
 
 class SiteReception:
-    """Messages that were received from one start of a site, and the counts of missing messages.
+    """Received messages from one start of a site, and the counts of its missing messages.
 
-    If a site is started again, a new object is created, which continues the counts of the
-    previous one.
+    A site is the process that controls one arm. If it is started again, a new object is
+    created, which continues the counts of the previous one.
 
     Args:
         scenario: Scenario of the session.

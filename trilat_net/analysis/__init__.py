@@ -1,6 +1,8 @@
-"""Computes numbers from the log of a run: delays, timeline, stability certificate and metrics.
+"""Computes results from the log of a run: delays, events, metrics and a stability judgement.
 
-A log contains a record for every tick of every site, the process that runs one arm.
+A log is the file that a run leaves behind. It has a record of the state of every arm for each
+period of the control loop. For example, `metrics` computes the RMS tracking error of an arm
+from these records, and `certificate` judges whether the run was stable.
 
 Invariant:
     - Nothing in this package draws, formats or prints. The package `presentation` does so.

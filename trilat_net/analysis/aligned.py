@@ -1,19 +1,18 @@
-"""Arranges the records of each arm with one row per tick, and views peers as it sees them.
+"""Aligns the recorded motion of an arm with the delayed motion of the arms that it follows.
 
-A site is the process that runs one arm, and its peers are the sites that it follows. In each
-tick, the period of its control loop, a site stores one record with its state. It also uses one
-sample per peer, which is a state that the peer sent earlier. Analyses need a row for every
-tick, even if the log lacks some records. They also need the motion of a peer at times between
-its ticks, for example at the time at which a sample was sent.
+A controller uses the state that another arm sent some time ago. Sums of energies therefore need
+the motion of that arm at the time of sending, which usually lies between two of its records.
+They also need every period of the control loop (tick), although a log may lack some records.
+`align_records` gives one row of numbers per tick of an arm. `PeerTrajectory` gives the motion
+of an arm at any time, and `DelayedPeer` the motion that another arm used.
 
 Invariant:
-    - A missing record is interpolated, so that sums have all their terms. Interpolated rows are
-      not marked as `known`, and no metric uses them.
-    - Between two records a peer moves along a cubic polynomial that meets the recorded angles
+    - A missing record is interpolated, so that sums have all their terms. Such a row is not
+      marked as `known`, and no metric uses it.
+    - Between two records, an arm moves along a cubic polynomial that meets the recorded angles
       and velocities. Before its first record it does not move.
-    - Within a tick period the delay of a peer's sample is assumed to be constant, as in the
-      stability theorem. At the end of the period, the difference from the next sample is
-      treated as a jump.
+    - Within a tick, the delay of the used state is constant, as the stability theorem assumes.
+      The difference from the next state is a jump at the end of the tick.
 """
 
 from collections.abc import Sequence

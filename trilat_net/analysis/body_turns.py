@@ -1,7 +1,9 @@
-"""Chooses the signs of the quaternions of moving bodies, so that they do not jump.
+"""Keeps the orientations of moving bodies continuous, so that plots of them do not jump.
 
-A quaternion and its negative describe the same orientation. The choice matters as soon as
-quaternions of successive times are plotted or interpolated.
+A unit quaternion and its negative describe the same orientation. If the sign changes from one
+time to the next, a plot of the quaternion jumps although the body moves smoothly, and an
+interpolation between the two is wrong. `BodyTurns` chooses the signs. It is used for the bodies
+of a simulated environment, whose poses are published many times per second.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
-"""Finds the period after which the delays of all links and the ticks of all sites repeat.
+"""Finds the time after which the network delays and the control periods of all arms repeat.
 
-A tick is one period of the control loop of a site, the process that runs one arm. A link is a
-connection between two sites. Its delay may be constant, follow a sinusoid, or follow a trace,
-a table of delays by time, that starts again at its end. A loop with such delays repeats after
-the least common multiple of all periods. Two sinusoids of 1.20 s and 1.21 s, for example,
-repeat after 145.2 s.
+A stability analysis of a loop with changing delays covers one such period. For example, two
+sinusoidal delays with periods of 1.20 s and 1.21 s repeat together after 145.2 s, the least
+common multiple. A delay may also be constant, or follow a trace, a table of delays by time that
+starts again at its end.
 
 Invariant:
     - Periods are computed in exact fractions of a second, so that no rounding error turns a

@@ -1,14 +1,16 @@
-"""Traces the weights with which arms follow each other, and computes their energy weights.
+"""Computes the weights with which arms follow each other over a run, and their energy weights.
 
-A site is the process that runs one arm. The dominance factor alpha_ij is the weight with which
-site i follows the motion of site j. The factors may change during a run, at once or in a ramp.
+A slave may follow two masters, for example with weights 0.7 and 0.3, and these weights may
+change during the run, at once or in a ramp. The weight with which arm i follows arm j is called
+the dominance factor alpha_ij. Analyses need the factors at every time, which `DominanceHistory`
+gives.
 
-The stability proof uses the sum of the energies of all sites, in which site i has the weight
+The stability proof uses a weighted sum of the energies of all arms. The weight of arm i is
 
     beta_i = pi_i / c_i
 
 Here pi is the left eigenvector of the matrix alpha for the eigenvalue 1 (the Perron vector),
-and c_i is the factor by which the damping gain of site i differs from that of the first site.
+and c_i is the factor by which the damping gain of arm i differs from that of the first arm.
 Without these weights the proof does not hold (docs/theory/errata-proof.md).
 
 Invariant:
@@ -143,11 +145,11 @@ def find_users(scenario: Scenario) -> tuple[str, list[str]]:
 
 
 class UserShares(NamedTuple):
-    """How a slave divides its motion between its users, at K times.
+    """How much of a slave's motion each of its users determines, at K times.
 
-    A slave follows the master of each user with a weight, the dominance factor. In some
-    experiments a program moves the arm of one user. While another user leads, a person
-    intervenes.
+    The slave follows the master of each user with a weight, the dominance factor. For example,
+    shares of 0.7 and 0.3 mean that the first user leads. In some experiments a program moves
+    the arm of one user. While another user leads, a person intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
@@ -482,7 +484,8 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
     """Finds the groups of sites that follow each other, and that follow nobody else.
 
     A site is the process that runs one arm. It may follow another site directly or through
-    further sites.
+    further sites. If there are several groups, the weights of the sites in the energy function
+    V are not unique.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

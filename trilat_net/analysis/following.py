@@ -1,19 +1,17 @@
-"""Computes how an arm moves its joints to follow other arms, for all records at once.
+"""Computes the reference motion that an arm should make to follow other arms, for many records.
 
-A site is the process that runs one arm. It follows other arms either joint by joint
-(`JointFollowing`), or with its end effector (`TaskFollowing`). Both classes have the same
-methods. The error e is the difference between the position of the arm and the position that it
-follows. From e the classes compute the reference velocity of the joints, which reduces e.
-`TaskFollowing` uses an inverse of the Jacobian J that is damped near singular poses.
+Arms follow each other either joint by joint (`JointFollowing`), or with their end effectors
+(`TaskFollowing`). Both classes compute the error e, the difference between the position of the
+arm and the position that it follows, and the joint velocities that reduce e. The simulation
+computes the same motion in compiled code. This second implementation in NumPy, from the
+equations of docs/reference/task-space.md, makes the stability certificate independent of it.
 
 Invariant:
-    - All functions are written with NumPy from the equations of docs/reference/task-space.md,
-      independently of the simulation.
     - Directions of space in which the end effector does not follow have no effect.
-    - Near a singular pose the end effector does not reach the velocity -Lambda e, where Lambda
-      is a gain in 1/s. The joint velocity v then satisfies J v = -Lambda e - d y. Here d is the
-      damping, y solves (J J' + d) y = -Lambda e - J p, and p is the velocity of the joints
-      towards a preferred posture.
+    - Near a singular pose of the arm, the inverse of the Jacobian J is damped. The end effector
+      then does not reach the velocity -Lambda e, where Lambda is a gain in 1/s. The joint
+      velocity v satisfies J v = -Lambda e - d y. Here d is the damping, y solves (J J' + d) y =
+      -Lambda e - J p, and p is the velocity of the joints towards a preferred posture.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,11 @@
-"""Decides about the stability of recorded and simulated runs, with all that is known.
+"""Decides whether a recorded or simulated run is stable, from all available evidence.
 
-A recorded run is certified by V, the energy function of the stability proof, by twins, which
-are repeated runs with a small push, and by the characteristic roots of its final loop. A
-simulated run without a log, as in a sweep, is decided in the same way. Its V is computed only
-if roots and pushes leave the decision open to it.
+The commands of the program call this module, so that all of them decide alike. `certify_run`
+judges the log of a run by three kinds of evidence: the energy function V of the stability
+proof, repetitions of the run with small disturbances (twins), and the characteristic roots of
+the linearised control loop. `judge_virtual_run` judges a simulated run without a log, for
+example one run of a parameter sweep. To save computing time, it computes V only if V may change
+the decision.
 
 Invariant:
     - All commands decide by `analysis.stability_decision.decide_stability`, with roots from

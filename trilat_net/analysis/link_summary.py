@@ -1,15 +1,14 @@
-"""Summarises the network links of a recorded run: delays, losses, counts and clocks.
+"""Summarises the network connections of a run: delays, losses, message counts and clocks.
 
-A site is the process that runs one arm. A link is the one-way connection from one site to
-another. In every tick of its control loop, a site sends a sample of its state. The receiver
-uses the newest sample that has arrived and whose emulated delay has passed. The effective delay
-of the link is the age of the sample in use (age of information; Kaul, Yates and Gruteser 2012).
+A link is the one-way connection from one arm to another. In every tick (period of its control
+loop), an arm sends its state over the link, which is called a sample. The receiver uses the
+newest sample that has arrived and whose emulated delay has passed. The effective delay is the
+age of the sample in use (age of information; Kaul, Yates and Gruteser 2012).
 docs/reference/metrics.md defines each quantity.
 
-The program delays samples itself, to emulate a network. Each delay depends only on the seed,
-the link and the number of the sample. Therefore this module can compute the delays again from
-the scenario, and compare them with the recorded arrivals. It also knows the delays of samples
-that never arrived.
+The program delays samples itself, to emulate a network. Each delay depends only on the random
+seed, the link and the number of the sample. Therefore `predict_delivery` can compute the delays
+again from the scenario, even for samples that never arrived.
 
 Invariant:
     - A quantity that the log does not determine is None.
@@ -284,7 +283,7 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """Statistics of a list of numbers, in the unit of the numbers.
+    """Mean, standard deviation, percentiles and extremes of some numbers, in their unit.
 
     Attributes:
         mean: Arithmetic mean.
@@ -727,7 +726,7 @@ def _count_samples(
 
 
 class DelayDistribution(NamedTuple):
-    """Delays and ages of the samples on one link.
+    """Delays and ages of all samples on one link, for a histogram.
 
     Attributes:
         peer: Name of the sender.

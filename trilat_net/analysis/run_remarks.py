@@ -1,7 +1,8 @@
-"""Finds conditions of a run that a reader of its judgement should know.
+"""Finds conditions of a run that a reader of its stability judgement should know.
 
-A site is a process that controls one arm. These conditions do not change the judgement whether
-a run was stable, but they show where the run was at the limits of its arms or of its computers:
+For example, a run may be stable although a motor was at its torque limit for 2 s. Such a
+condition does not change the judgement, but shows that the arms or the computers were at their
+limits. A remark is made if:
 
 - a motor was at its torque limit, so that the control law did not act in full;
 - an operator or a wall pushed with a large share of the torque limit;
@@ -10,7 +11,7 @@ a run was stable, but they show where the run was at the limits of its arms or o
 - a program of the user moved an arm, or failed while it did.
 
 Invariant:
-    - A remark states a number for each site that it names.
+    - A remark states a number for each arm that it names.
     - A condition that did not occur has no remark.
 """
 

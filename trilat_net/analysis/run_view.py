@@ -1,13 +1,14 @@
 """Provides the data of a recorded run from which all metrics are computed.
 
-A site is the process that runs one arm. For each site, the data contain the records of all
-ticks of its control loop, and the torques of operators and environments on its arm. They also
-contain the dominance factors (the weights with which the sites follow each other), the network
-links between the sites, and the virtual walls.
+A metric is a number that describes a run, such as the largest torque. Many metrics need the
+same data, for example the torques of operators on an arm, whose computation takes time.
+`RunView` computes such data when a metric first needs them, and keeps them for the other
+metrics. `SiteRun` has the data of one arm: its records and the torques on it. `RunView` adds
+the weights with which the arms follow each other, the network links and the virtual walls.
 
 Invariant:
-    - Each quantity is computed from the log only once, when a metric needs it first, by
-      `RunView.compute_once` or by a cached property.
+    - Each quantity is computed from the log only once, by `RunView.compute_once` or by a cached
+      property.
 """
 
 from collections.abc import Callable, Iterable
@@ -30,7 +31,7 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """One site of a recorded run: its motion, its torques and whom it follows.
+    """One arm in a recorded run: its motion, its torques, and how it follows the other arms.
 
     Attributes:
         records: Records of the site, with one row for every tick.

@@ -1,8 +1,8 @@
-"""Defines the signals of an arm, and its settling time.
+"""Computes signals of an arm from its records, such as tracking errors, and its settling time.
 
-A signal is an array with a row for each record (the result of one tick of the arm's control
-loop), such as the errors of the joints. `presentation.plot_signals` has the signals that only
-figures show, and reduces signals for plots.
+A signal is an array with one row for each record of the log, that is for each period of the
+control loop. The settling time is the time after which an error stays small. Signals that only
+figures show are in `presentation.plot_signals`.
 
 Invariant:
     - Each signal has one definition, for figures, pages, summaries and metrics.
@@ -62,7 +62,7 @@ def external_torques(part: SiteLog) -> Array:
 
 
 class JointError(NamedTuple):
-    """The largest error |e| among some records, with its place and time.
+    """The largest error |e| in some records, with the joint and the time at which it occurred.
 
     Attributes:
         value: The error, in the unit of the shared coordinates.

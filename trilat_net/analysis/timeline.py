@@ -1,9 +1,8 @@
-"""Lists what happened in a run over time: changes, link models, modes of the arms, and alarms.
+"""Lists what happened in a run over time: commands, network delays, modes of the arms, alarms.
 
-A site is the process that runs one arm. A change is a command that alters the run: another
-delay of a link, other dominance factors (the weights with which a site follows its peers), or
-an order to a site such as "stop". A mode is what a site does in a tick of its control loop: it
-follows its peers, holds its position, brakes or returns.
+For example, a command may change a delay at 5 s, or stop all arms at 8 s. A reader of a figure
+or of a judgement needs these times. The mode of an arm is what its controller does: it follows
+other arms, holds its position, brakes or returns.
 
 Invariant:
     - Every entry comes from the scenario or from a record. No entry is inferred from the motion

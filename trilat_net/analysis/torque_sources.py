@@ -1,9 +1,10 @@
-"""Splits the external torque on an arm into the torques of operator and environment.
+"""Splits the external torque on an arm into the torques of the operator and of the environment.
 
-Operators and environments, such as virtual walls, push an arm. The scenario, the description of
-the experiment, contains a model of each. In every tick of the control loop, the sum of their
-torques is recorded. This module evaluates the models for all records at once, and splits the
-sum. All torques are those that act on the arm.
+A log contains only the sum of the torques with which operators and environments, such as
+virtual walls, push an arm. Metrics need them separately, for example to compute the work of the
+operator. The scenario (the description of the experiment) contains a model of each. This module
+evaluates the models for all records at once and splits the sum. All torques are those that act
+on the arm.
 
 Invariant:
     - Torques are computed from the definitions in the scenario, independently of the

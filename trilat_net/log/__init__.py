@@ -1,4 +1,11 @@
-"""The MCAP log: write, read, check and recover it. The only importer of `mcap`."""
+"""Writes, reads, checks and recovers logs, the files in which the messages of a run are stored.
+
+A log is a file in the format MCAP, which general viewers for robot data can open as well. For
+example, `open_log("run.mcap")["s"].q` is an array of the joint angles of the arm "s" over time.
+
+Invariant:
+    - No other package imports `mcap`.
+"""
 
 from typing import TYPE_CHECKING
 

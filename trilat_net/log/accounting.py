@@ -1,15 +1,13 @@
 """Counts the messages of a session: which were received, and which are missing.
 
-The messages of a channel are numbered consecutively. Therefore a gap in the numbers shows that
-a message is missing. An `Account` holds these counts for one channel. A recorder updates its
-accounts while it records, and a tool can compute them again later from the log.
+The messages of a channel are numbered consecutively. A gap in the numbers therefore shows that
+a message is missing: after the numbers 1, 2 and 5, the messages 3 and 4 are missing. An
+`Account` holds these counts for one channel. The process that writes a log (the recorder)
+updates its accounts while it records, and a check of the log computes them again later.
 
-A site is a process that runs one arm. A tick is one period of its control loop, and a record is
-the message with the results of one tick. The number of a record is the number of its tick.
-Statistics and events are numbered from 0.
-
-Some numbers never had a message: a site that is late skips ticks, and a site that is killed and
-started again continues at a later tick. These numbers count as unpublished instead of missing.
+The results of an arm's control loop are numbered by its periods (ticks). Some numbers never had
+a message: an arm that is late skips ticks, and an arm whose process is killed and started again
+continues at a later tick. These numbers count as unpublished instead of missing.
 
 Invariant:
     - In every account, the number of expected messages is the sum of the received and the
@@ -519,7 +517,7 @@ MIN_COVERAGE = 0.999
 
 
 class Coverage(NamedTuple):
-    """States for each site which part of a run was recorded, or checked by a tool.
+    """What part of a run was recorded, or checked by a tool, for each site.
 
     A site is a process that runs one arm. A tick is one period of its control loop.
 

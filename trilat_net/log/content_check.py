@@ -1,23 +1,24 @@
-"""Checks messages by their content, if no checksum covers them.
+"""Decides by the content of a message whether it is genuine, where no checksum covers it.
 
-A log stores the messages of a session in compressed chunks. If a recording was interrupted, the
-checksum of the last chunk is missing, but the recovery still wants to use its messages. A log
-states the identity of each message in four ways: by its position in the file, by its channel,
-by its sequence number, and in the message itself. If all four agree, damage can only have
-changed numbers inside that one message.
+A log stores messages in compressed chunks, each with a checksum. If a recording was
+interrupted, for example by a power failure, the checksum of the last chunk is missing. The
+recovery of the log still wants to use the messages of this chunk. A log states the identity of
+each message in four ways: by its position in the file, by its channel, by its sequence number,
+and in the message itself. If all four agree, damage can only have changed numbers inside that
+one message.
 
 Invariant:
     - An accepted message can be decoded with the schema of its channel. It comes from the
-      member of the session to whom the channel belongs, and from the same start of that member
-      as the previous message.
+      sender to whom the channel belongs, and from the same start of that sender's process as
+      the previous message.
     - It has the next number of its channel, and is stored with that number and its sending
       time.
     - Its arrival time is within the time range that its chunk states, and not before the
       arrival of the previous message.
     - After the first message that fails, no message is accepted.
     - In virtual time (a simulation without clocks), the scenario determines the random number
-      that identifies the start of each site. Therefore every message identifies its scenario,
-      including the seed. A chunk of another run is refused, even if a checksum covers it.
+      that identifies the start of each arm's process. Therefore a chunk of a run with another
+      scenario or seed is refused, even if a checksum covers it.
 """
 
 import re

@@ -1,21 +1,19 @@
-"""Converts a log to data tables, with a row per record, arrival, statistics message or event.
+"""Converts a log to tables of numbers, which are exported to CSV, Parquet and data frames.
 
-The tables are exported to CSV, Parquet and data frames. A site is a process that runs one arm.
-A record is the result of one tick, a period of the site's control loop. An arrival is the
-receipt of a sample, the state that another site sent.
+There are four kinds of tables for an arm or a run: the states of an arm (a row for each period
+of its control loop), the states that it received from other arms, the statistics of its network
+connections, and the events of the run. For example, a column of the first kind is `q1_rad`, the
+angle of joint 1.
 
 Invariant:
-    - Every number is a number of the record, or follows from the record exactly (an age is a
-      difference of time stamps). The only exceptions are orientations. A record contains an
-      orientation as a rotation vector, which jumps where it passes half a turn. The table
-      contains it as a unit quaternion, whose sign continues from row to row (see
-      `orientations`), and the meaning of the column states that.
+    - Every number is a number of the log, or follows from it exactly (an age is a difference of
+      time stamps). The only exceptions are orientations, which the table contains as unit
+      quaternions that do not jump (see `orientations`).
     - The name of a column ends in its unit. A missing value is null, never a number.
-    - Units come from the schema of the messages, and meanings from the docstrings of the
-      message types. Units and names of the numbers that a control law sends come from the
-      law's declaration. Thus nothing is described in two places.
-    - A number out of range, or an arrival from a peer (another site) that a site does not have,
-      raises a `LogError` that names the file (`source`).
+    - Units, names and meanings come from the message types and from the declarations of control
+      laws. Thus nothing is described in two places.
+    - A number out of range, or a state from an arm that an arm does not follow, raises a
+      `LogError` that names the file.
 """
 
 import dataclasses

@@ -1,7 +1,8 @@
 """Defines the results of checks: whether each check passed, and the problems that it found.
 
 A check examines one property of a log, the file with the messages of a session, for example
-that no message is missing. Its result is called a finding.
+that no message is missing. Its result is a `Finding`. `trilat log check` prints one line per
+finding.
 
 Invariant:
     - A check with a problem has not passed.

@@ -1,8 +1,8 @@
 """Writes the file of a log so that it survives crashes, power failures and full disks.
 
-A log contains the messages of a session in the file format MCAP. The file is called
-run.mcap.active while it is recorded, and run.mcap after it is complete. Data are flushed when
-the operating system has them, and synced when they are on the disk.
+A log contains the messages of a run. While it is recorded, the file is called run.mcap.active,
+and after it is complete, run.mcap. Data are flushed when the operating system has them, and
+synced when they are on the disk.
 
 Invariant:
     - Flushed data survive the death of the process. Synced data survive a loss of power.

@@ -1,9 +1,9 @@
-"""Defines the layout of a log: its file names, its metadata and its channels.
+"""Defines how a log is stored: the names of its files, its metadata and its channels.
 
-A log contains the messages of a session, a joint run of several arms, in the file format MCAP.
-A channel contains the messages of one kind and sender. A recording that is split has several
-files, the parts. The metadata of a log state the session, the filter (which channels are
-recorded), and the provenance, see `log.provenance`.
+A log contains the messages of a run in the file format MCAP. While it is recorded, the file is
+called run.mcap.active. A recording that is split has the files run-001.mcap, run-002.mcap and
+so on. A channel contains the messages of one kind and sender. The metadata state the session,
+the filter (which channels are recorded), and the versions of the program (`log.provenance`).
 
 Invariant:
     - A channel that the filter excludes is neither in the file nor in the counts of messages.

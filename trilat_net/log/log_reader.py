@@ -1,15 +1,13 @@
-"""Opens recorded sessions, and gives access to the records of every site.
-
-A log is the MCAP file of a run. A session may have several files, because a recorder can split
-its log, and because several recorders can record parts of one session. They are read as one:
+"""Opens the log of a run, and gives access to the states of each arm as arrays.
 
     log = open_log("run.mcap")
     log["m1"].t_s, log["m1"].q
 
-Here "m1" is a site, a process that runs one arm and its control loop. A record is the stored
-result of one tick, a period of that loop.
+Here "m1" is the name of an arm, t_s is the time of each period of its control loop, and q has
+its joint angles, a row per period. A run may have several files, because a recorder can split
+its log, and because several recorders can record parts of one session. They are read as one.
 
-`read_link_delays` extracts the measured delays of a link between two sites, so that a scenario
+`read_link_delays` extracts the measured network delays between two arms, so that a scenario
 with `model = "trace"` can reproduce them.
 
 Invariant:

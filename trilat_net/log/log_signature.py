@@ -1,11 +1,10 @@
-"""Signs logs, and checks their signatures.
+"""Signs logs, so that anybody can check later that a log was not changed.
 
 A log contains digests of its contents (`running_digest`). The owner of a private key signs
-these digests with the method Ed25519. The signature is stored in a separate file beside the
-log. Anybody who has the public key can check that the log is exactly the one that was signed.
-
-A signature covers all messages and everything that describes them, but not the compression.
-Therefore it is also valid for a copy of the log that was compressed differently.
+these digests with the method Ed25519, and stores the signature in a separate file beside the
+log. Whoever has the public key can check that the log is the one that was signed. A signature
+covers all messages and everything that describes them, but not the compression. It is therefore
+also valid for a copy of the log that was compressed differently.
 
 Invariant:
     - A log is only read, and never changed.

@@ -89,7 +89,7 @@ writes a message.
 
 
 class LogWriter:
-    """Writer of one log file.
+    """Writes the messages of a session, and everything that describes them, to one log file.
 
     Besides the messages as they were published, it can write messages for viewers, which are
     derived from them.
@@ -351,7 +351,7 @@ It is used for the accounts, and for the messages for viewers that follow from o
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """States where a log is stored, and how it is divided into parts.
+    """Where a log is stored, and when a new file (part) of it begins.
 
     Attributes:
         path: Name of the log. The name of a part also contains its number.
@@ -417,7 +417,9 @@ class LogStorage:
 
 
 class LogParts:
-    """Writer of a log in as many files as its limits require; a context manager.
+    """Writes a log to as many files as its limits of size and duration require.
+
+    It is a context manager.
 
     Args:
         storage: Place of the log, and its division into parts.

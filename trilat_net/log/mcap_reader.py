@@ -94,7 +94,7 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
 
 
 class ChannelInfo(NamedTuple):
-    """Describes a channel, a sequence of messages of one kind, as an MCAP file defines it.
+    """Description of a channel in an MCAP file, that is of a sequence of messages of one kind.
 
     Attributes:
         topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -115,7 +115,7 @@ class ChannelInfo(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """One message as an MCAP file contains it, still encoded.
+    """One message of an MCAP file, with its channel, times and number, still encoded.
 
     Attributes:
         topic: Topic of the channel. Empty if the file does not define the channel.
@@ -204,11 +204,10 @@ _BLOCK_BYTES = 1 << 12
 
 
 class McapReader:
-    """Reader of one MCAP file, from its beginning to its end.
+    """Reads one MCAP file from its beginning to its end, also if the file is damaged.
 
-    There are three ways of reading. `messages` yields the messages, and nothing else. `blocks`
-    yields them in blocks, which is much faster. `scan` yields the records and the damaged parts
-    of the file, as the scanner finds them, for the check and the recovery of damaged files;
+    `messages` yields the messages one by one, and `blocks` in blocks, which is much faster.
+    `scan` yields the records and the damaged parts of the file, for its check and its recovery.
     `read_record` yields the messages of a record.
 
     Args:
@@ -780,7 +779,7 @@ _FIRST_BYTES = 1 << 12
 
 
 class ChannelMessages:
-    """Messages of one topic as a log contains them, still encoded, in the order of the file.
+    """The messages of one topic in a log, still encoded, in the order of the file.
 
     Attributes:
         log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
@@ -874,7 +873,7 @@ def _clip_times(times: "array[int]") -> NDArray[np.int64]:
 
 @dataclass
 class LogContents:
-    """Contents of a log before its messages are decoded, from one file or from several parts.
+    """Everything in a log, from one file or several parts, before its messages are decoded.
 
     Attributes:
         sources: Names of the files.

@@ -82,7 +82,7 @@ class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk, a block of compressed records, which describes these records.
+    """Header of a chunk, a compressed block of records: sizes, times and compression.
 
     Attributes:
         start_ns: Arrival time of the earliest message in the chunk, in ns.
@@ -234,7 +234,7 @@ def iterate_records(data: bytes | bytearray, offset: int = 0) -> Iterator[tuple[
 
 
 class RecordFrame(NamedTuple):
-    """Kind and place of a record in an MCAP file.
+    """Kind, position and length of a record in an MCAP file, without its content.
 
     Attributes:
         offset: Offset of the record's first byte in the file.
@@ -277,7 +277,7 @@ class Damage(NamedTuple):
 
 
 class ScannedRecord:
-    """A record at its place in a file, which is read when it is needed.
+    """A record that was found in a file, whose content is read only when it is needed.
 
     Args:
         scanner: Scanner that has found the record.
@@ -334,7 +334,7 @@ class ScannedRecord:
 
 
 class RecordScanner:
-    """Scanner that finds the records of a file, and skips damaged parts.
+    """Finds the records of a file one after another, and skips damaged parts.
 
     Every program that reads a file, whether it checks, recovers or verifies it, reads the
     records that this scanner yields.
@@ -592,7 +592,7 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Checks the content of an attachment, such as the scenario, by the checksum at its end.
+    """Checks an attachment, such as the scenario of a log, by the checksum at its end.
 
     Args:
         attachment: Content of the attachment's record.

@@ -1,8 +1,8 @@
 """Identifies a message by its content: sender, channel, number and sending time.
 
-A log contains the messages of a session, in chunks and numbered within channels. The checks
-and the recovery of logs use the identity to find messages that are in the wrong place of a
-file, for example because a damaged disk returned an old block.
+A damaged disk may return an old block, so that a message of another run lies in the middle of a
+log. The checks and the recovery of logs find such messages by comparing the identity of a
+message with its place in the file.
 
 Invariant:
     - The identity depends only on the content of the message, and never on its place in the

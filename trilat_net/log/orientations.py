@@ -1,11 +1,10 @@
 """Converts orientations to time series without jumps: unit quaternions, or six numbers.
 
-A record contains an orientation as a rotation vector: the axis of a rotation times its angle,
+A log contains an orientation as a rotation vector: the axis of a rotation times its angle,
 which is at most half a turn. When the angle passes half a turn, as it does for a tool that
 points down, the vector jumps by a whole turn, although the orientation changes smoothly. Adding
-whole turns to the vector cannot avoid these jumps for every motion. Near half a turn, the
-vector also changes by up to pi / 2 times the angle by which the orientation turns. Time series
-that leave the program therefore have one of these forms:
+whole turns to the vector cannot avoid these jumps for every motion. Time series that leave the
+program therefore have one of these forms:
 
 - Unit quaternions w, x, y, z. A quaternion and its negative are the same orientation. The sign
   is chosen so that each quaternion is nearest to the previous one, and the first has w >= 0. A
@@ -16,7 +15,7 @@ that leave the program therefore have one of these forms:
   2019). A turn by a small angle moves them by at most sqrt(2) times that angle.
 
 Invariant:
-    - The rotation is that of the record, except for rounding. Only its representation differs.
+    - The rotation is that of the log, except for rounding. Only its representation differs.
     - Rotation vectors of any length are accepted.
 """
 

@@ -1,4 +1,6 @@
-"""Collects the provenance of a log: the program that wrote the log, with its versions.
+"""Collects the versions of the program and its packages, which are stored in every log.
+
+With them, a run can be repeated later with the same program (law L5 of docs/develop/design.md).
 
 Invariant:
     - The provenance contains versions, commit and platform, but no path, time or host name, so

@@ -1,9 +1,8 @@
-"""Decodes single fields of many records into arrays.
+"""Decodes single fields of many records into arrays, without decoding whole records.
 
-A record is the encoded result of one tick of a site's control loop. To decode only the fields
-that are needed is much faster than to decode whole records.
-
-Every function raises `WireError` for the first payload that is not a valid record.
+This is much faster if only some fields are needed. A record is the encoded state of an arm in
+one period of its control loop. For example, `decode_ticks` returns the number of the period of
+each record. Every function raises `WireError` for the first message that is not a valid record.
 
 Invariant:
     - Only the requested fields are decoded.

@@ -75,7 +75,7 @@ _REGENERATED = frozenset(
 
 @dataclass(repr=False)
 class Recovery(Result):
-    """Result of a recovery.
+    """Result of a recovery: what was copied to the new file, and what was lost.
 
     Attributes:
         path: The source file.

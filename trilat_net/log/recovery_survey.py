@@ -44,7 +44,7 @@ _SAMPLED_CHUNKS = 16
 
 
 class RecoverySurvey:
-    """Contents of a damaged file besides its messages.
+    """Everything in a damaged file except its messages: metadata, definitions and chunks.
 
     The recovery creates this object first, and then copies the messages to a new file.
 

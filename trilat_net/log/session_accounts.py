@@ -1,8 +1,8 @@
 """Counts the received and missing messages of all channels of a session.
 
-`SessionAccounts` contains an `Account` for each channel whose messages have numbers. The events
-of the sites state which ticks exist: when a site began, which ticks it skipped, and when it
-ended.
+A channel contains the numbered messages of one kind and sender. `SessionAccounts` has an
+`Account` for each channel. It follows the events with which the arms state which control
+periods exist: when an arm began, which periods it skipped, and when it ended.
 
 Invariant:
     - To count the messages of a file, only the events are decoded.
@@ -39,9 +39,9 @@ _EVENTS_NUMBERED_SINCE = 3
 class SessionAccounts:
     """Counts the received and missing messages of all numbered channels of a session.
 
-    A recorder uses this class while it records, and the tools use it to count the messages of a
-    log. The caller passes every message. From the events, the class learns how many ticks the
-    sites executed.
+    A recorder uses this class while it records, and the check of a log counts with it later.
+    The caller passes every message. From the events, the class learns how many periods (ticks)
+    of its control loop each arm executed.
 
     Args:
         session: Name of the session.
@@ -455,7 +455,7 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Creates the object that counts the messages of a file, before they are read.
+    """Creates the counters of a session, before the messages of a file are read.
 
     Args:
         metadata: Metadata of the file, by name. They state the session.

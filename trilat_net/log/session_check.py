@@ -1,10 +1,10 @@
 """Checks a log: its bytes, its completeness, and its agreement with its scenario.
 
-A log contains the messages of a session in the file format MCAP, and the scenario, the
-description of the experiment. The bytes of any MCAP file are checked. The content is checked
-only if the file is a log of trilat-net: each message is compared with the place in the file
-where it is stored, with the scenario, and with the earlier messages. The control laws are not
-executed again; `trilat_net.execution.verification` does that.
+It does the work of `trilat log check`. The bytes of any MCAP file are checked. The content is
+checked only if the file is a log of trilat-net: each message is compared with the place in the
+file where it is stored, with the scenario (the description of the experiment), and with the
+earlier messages. The control laws are not executed again; `trilat_net.execution.verification`
+does that.
 
 Invariant:
     - Each check produces one finding, with the places where the check failed.

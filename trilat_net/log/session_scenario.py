@@ -1,8 +1,9 @@
-"""Describes which facts about a scenario a log and its recorder need.
+"""Lists the few facts about an experiment that a log and its recorder need.
 
-A recorder stores the messages of a session without understanding the experiment. Therefore it
-depends on these few facts, and not on the program that reads scenarios. `scenario.Scenario` has
-all of them.
+A recorder stores the messages of a session without understanding the experiment. For example,
+it needs the names of the arms and the duration of the run, but no control law. It therefore
+depends on the classes here, and not on the program that reads scenarios (descriptions of
+experiments). `scenario.Scenario` has all of these facts.
 """
 
 from collections.abc import Mapping

@@ -1,12 +1,12 @@
-"""Gives access to the records of one site of a log, as arrays over time or one by one.
+"""Gives access to the recorded states of one arm, as arrays over time or one by one.
 
-A site is a process that runs one arm and its control loop. It publishes a record in every tick,
-a period of this loop. A log stores the records as encoded bytes. This module decodes the fields
-of all records into arrays (`SiteLog.q`), or whole records into objects (`SiteLog.states`).
+An arm publishes a record of its state in every period of its control loop, and a log stores the
+records as encoded bytes. This module decodes the fields of all records into arrays (`SiteLog.q`
+has the joint angles), or whole records into objects (`SiteLog.states`).
 
 Invariant:
     - Only the requested fields and records are decoded.
-    - An invalid record raises an error that names the site.
+    - An invalid record raises an error that names the arm.
     - The memory for whole records is bounded, however long the log is: long sequences of
       records are decoded in blocks when they are accessed.
 """

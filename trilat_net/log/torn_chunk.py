@@ -1,13 +1,13 @@
-"""Recovers the records of a chunk that was cut off, block by block.
+"""Recovers messages from a compressed block of a log that was cut off.
 
 An MCAP file stores messages in compressed chunks. If a recording is interrupted, the last chunk
-may be incomplete. The checksum of a chunk covers all of its records. Therefore the checksum
-proves nothing if the end is missing. But the compressed data consist of blocks, pieces that can
-be unpacked as a whole, and all complete blocks can be used.
+may be incomplete. Its checksum proves nothing then, because it covers all messages of the
+chunk, including those at the missing end. But the compressed data consist of blocks, which can
+be unpacked one by one, and the messages of all complete blocks can be used.
 
 Invariant:
-    - The records of a block are used together or not at all, because damage in the compressed
-      bytes of a block may falsify any of its records, including records that still look right.
+    - The messages of a block are used together or not at all, because damage in the compressed
+      bytes of a block may falsify any of its messages, including some that still look right.
     - Compressed bytes are read up to the first doubtful page. A page that contains only zeros
       was never written to the disk. A page that is equal to another page of the file was
       written to the wrong place.
@@ -48,7 +48,7 @@ InnerRecord = tuple[int, bytes]
 
 
 class TornChunk(NamedTuple):
-    """A compressed block of messages (chunk) that reaches beyond the end of its file.
+    """A compressed block of messages (chunk) whose end is missing from its file.
 
     This happens when a recording is interrupted. The messages in the existing part can still be
     recovered.

@@ -1,4 +1,8 @@
-"""Rates of the messages for viewers, which a log may contain beside those of a session."""
+"""Defines how often a log gets messages for general viewers, such as Foxglove.
+
+Viewers cannot decode the messages of a session. A log may therefore contain standard messages
+beside them (`ros2.viz_channels`), at a lower rate to keep the file small.
+"""
 
 import math
 

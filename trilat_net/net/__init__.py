@@ -1,13 +1,14 @@
-"""Exchanges messages between the processes of a session over the network.
+"""Exchanges messages between the processes of a running session over the network.
 
-A session is a run in which several processes each control one robot arm, while others record
-the messages or let people take part.
+In a session, several processes each control one robot arm, and other processes record the
+messages or let people take part. For example, the process of a slave arm receives the positions
+of two master arms, typically a thousand times per second. The package contains:
 
-The package contains the network connection (`bus`, `zenoh_bus`, `connection`, `member_keys`),
-the messages and their encoding (`messages`, `requests`, `wire`, `topics`), the clocks and their
-comparison (`clock`, `pinging`, `offset`, `timing`), and the agreement of the processes on the
-start of a session (`membership`, `session`, `discovery`). Programs outside a session connect
-with `arm_client`, `known_sites` and `ros2_graph`.
+- the network connection: `bus`, `zenoh_bus`, `connection`, `member_keys`;
+- the messages and their encoding: `messages`, `requests`, `wire`, `topics`;
+- the clocks of the machines and their comparison: `clock`, `pinging`, `offset`, `timing`;
+- the common start of all processes: `membership`, `session`, `discovery`;
+- connections of other programs to a session: `arm_client`, `known_sites`, `ros2_graph`.
 """
 
 from typing import TYPE_CHECKING

@@ -12,10 +12,9 @@ applies the torque that the site publishes:
             robot.wait()
 
 `SwitchClient` reports whether somebody holds the dead-man switch of such an arm. `Hand` lets a
-person or a program move an arm as its operator.
-
-Torques and forces are read from the record that the site publishes in every tick. The recorder
-stores the same records. Therefore the log contains exactly what was applied to the arm.
+person or a program move an arm as its operator. Clients read torques and forces from the
+records that the recorder stores as well. Therefore the log contains exactly what was applied to
+the arm.
 
 Invariant:
     - `ArmClient.torque` returns None if no valid torque is available. The arm must then brake.

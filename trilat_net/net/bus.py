@@ -1,13 +1,14 @@
-"""Defines the interface of a member's network connection, and the queues of waiting messages.
+"""Defines the interface of a process's network connection, and the queues of waiting messages.
 
-A member is a process that takes part in a session. Its network connection, the bus, publishes
-messages under keys, receives the messages of other members, and sends and answers queries.
-`zenoh_bus` implements the interface over Eclipse Zenoh. Tests implement it within one process.
+The control loop of an arm must never wait for the network, and should lose little time to it.
+The network connection, the `Bus`, therefore puts arriving messages into queues, from which the
+loop removes them when it has time. It also publishes messages under keys, and sends and answers
+queries. `zenoh_bus` implements the interface over Eclipse Zenoh. Tests implement it within one
+process.
 
 Invariant:
-    - When a message arrives, the network thread of a site only reads the time, decodes the
-      message and appends it to a queue, or sends a short reply. The control loop therefore
-      loses little time to network threads.
+    - When a message arrives, the network thread only reads the time, decodes the message and
+      appends it to a queue, or sends a short reply.
     - Messages wait in queues of limited length until the control loop polls them. If a queue is
       full, the oldest message is dropped. The receiver notices the gap because messages are
       numbered.

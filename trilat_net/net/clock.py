@@ -1,9 +1,11 @@
 """Provides the clocks that all other modules use to read the time and to sleep.
 
-No other module reads a clock of the operating system. Code that needs the time receives a
-`Clock` as an argument (law L1 of docs/develop/design.md), so that tests and simulations can use
-a clock of their own. Times are integers in ns, because floating-point numbers would lose
-precision after a few months.
+Code that needs the time receives a `Clock` as an argument, so that tests and simulations can
+use a clock of their own, for example one that drifts (law L1 of docs/develop/design.md). Times
+are integers in ns, because floating-point numbers would lose precision after a few months.
+
+Invariant:
+    - No other module reads a clock of the operating system.
 """
 
 import platform
@@ -53,7 +55,7 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The clocks of this machine, as the operating system provides them."""
+    """The clocks of the operating system of this machine."""
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
     """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""

@@ -1,14 +1,11 @@
 """Decides how a process connects to the network of a session, and runs the router process.
 
-A session is a run in which several processes ("sites") each control one robot arm. A
+Two processes of a session on one machine find each other without any option. The process of
+each arm (the site) has a default port, which follows from the name of the session and the index
+of the site. On several machines, the user names the endpoints, for example tcp/host:10241. A
 `Connection` consists of the endpoints at which a process listens and to which it connects, its
-mode, and optionally the keys that prove its identity. Opening it returns the bus through which
-messages are sent. `Connection.of_member` derives the connection from the command line and
-a user's Zenoh file.
-
-Each site of a session has a default endpoint on this machine: a port that follows from the name
-of the session and the index of the site. Processes that are started in separate terminals
-therefore find each other without any option.
+mode, and optionally the keys that prove its identity. `Connection.of_member` derives it from
+the command line and a user's Zenoh file.
 
 Invariant:
     - Default endpoints are addresses of this machine only (127.0.0.1). Nobody else can connect
@@ -18,7 +15,7 @@ Invariant:
     - An endpoint that the user names replaces the default. If the command line and the file
       name different ones, they are united or refused, but the program never silently prefers
       one of them.
-    - A router forwards the messages of all sessions. It prints which members join and leave.
+    - A router forwards the messages of all sessions. It prints which processes join and leave.
 """
 
 import ipaddress
@@ -163,7 +160,7 @@ RETRY_NS = 200_000_000
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """How a process connects to the network: endpoints, mode and keys.
+    """How a process connects to the network of a session: endpoints, mode and keys.
 
     Attributes:
         listen: Endpoints at which the process listens.

@@ -1,14 +1,13 @@
-"""Finds a running session from outside, connects to it, and sends requests to its sites.
+"""Finds a running session from outside, connects to it, and sends requests to its arms.
 
-Programs that are not part of a session use this module: the commands that stop arms, change
-links or measure the network, and a playback of a log. A session consists of processes
-("sites") that each run one arm, and optionally recorders.
+This module serves programs that are not part of a session: the commands that stop arms, change
+network delays or measure the network, and a playback of a log.
 
 Invariant:
     - A change is requested only once, because a second request might apply it twice. The caller
-      receives either a reply, or an error that names the site that did not reply.
-    - A log is not played back under the name of a session whose sites are present, because
-      programs could not distinguish the messages of the log from those of the session.
+      receives either a reply, or an error that names the arm that did not reply.
+    - A log is not played back under the name of a session that is running, because programs
+      could not distinguish the messages of the log from those of the session.
 """
 
 import math

@@ -1,9 +1,9 @@
-"""Checks that host names in endpoints can be resolved, before a connection is opened.
+"""Refuses misspelt host names before a network connection is opened.
 
-An endpoint is a network address of a process, such as tcp/host:10241. Zenoh, the library that
-transports the messages, would try to connect to a misspelt host name for ever, without an
-error. The check queries the name service for each host name, and opens no connection. Endpoints
-without a host name, such as numeric addresses and socket files, need no check.
+Zenoh, the library that transports the messages, would try to connect to a misspelt host for
+ever, without an error. `check_hosts` therefore asks the name service for the host name of each
+endpoint, a network address such as tcp/host:10241, and opens no connection. Endpoints without a
+host name, such as numeric addresses and socket files, need no check.
 """
 
 import ipaddress

@@ -1,8 +1,8 @@
-"""Remembers which sites run on this machine, so that `trilat stop` reaches them immediately.
+"""Remembers which arms run on this machine, so that `trilat stop` reaches them immediately.
 
-A site is a process that runs one arm. While it runs, it stores its network endpoints in a small
-file, in a folder that belongs to the user who started it. `trilat stop` reads these files and
-connects to the sites at once, instead of first searching for the session on the network.
+The process that controls an arm (the site) stores its network endpoints in a small file while
+it runs. `trilat stop` reads these files and connects to the sites at once, instead of first
+searching for the session on the network.
 
 Invariant:
     - The files are only a shortcut. A site runs without its file, and a file whose process is

@@ -1,9 +1,10 @@
-"""Creates, adds, renews and reads the keys by which members of a session prove who they are.
+"""Creates, renews and reads the keys with which the processes of a session prove who they are.
 
-A member is a process that takes part in a session, such as a site or a recorder. `trilat keys
-new` creates a private certificate authority for the session, which signs one certificate per
-member. Zenoh encrypts all connections with these keys (TLS or QUIC with certificates of both
-ends).
+Without keys, any program that can reach the process of an arm over the network could send
+messages to it. `trilat keys new` creates a private certificate authority for the session, which
+signs one certificate per member, that is per process that takes part, such as the process of an
+arm. Zenoh, the library that transports the messages, encrypts all connections with these keys
+(TLS or QUIC with certificates of both ends).
 
 Every member loads the keys in its own folder. The folder contains its private key, its
 certificate, the certificate of the authority, and the list of all members, from which the

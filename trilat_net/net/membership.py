@@ -1,13 +1,11 @@
 """Finds out which processes take part in a session, and which of them are present.
 
-A member is a process that takes part in a session: a site, which runs one arm and its control
-loop, or a recorder, which writes the log. Every start of a process has a boot, a random number
-that distinguishes the start from earlier and later ones.
-
-Members find each other in two ways. Each member declares a Zenoh liveliness token whose key
-contains its boot, so that the network itself reports when the member appears and disappears.
-Each member also replies to queries with its identity (`Info`): the boot, the scenario, the
-clock and the state of the session.
+These processes are called members. A member is a site, which runs one arm and its control loop,
+or a recorder, which writes the log. Members find each other in two ways. Each member declares a
+Zenoh liveliness token, so that the network itself reports when the member appears and
+disappears. Each member also replies to queries with its identity (`Info`): the scenario, the
+clock, the state of the session, and the boot. The boot is a random number that distinguishes a
+start of a process from earlier and later starts.
 
 Invariant:
     - A site gives up if the session runs already, if another member has another scenario, or if
@@ -262,7 +260,7 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Settings of one site for joining a session that is already running.
+    """Settings of one site: whether it may join a running session, and whom a start awaits.
 
     Attributes:
         may_join_late: True if this site may join a running session. The caller sets it only if

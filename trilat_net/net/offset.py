@@ -1,6 +1,7 @@
-"""Estimates the offset and drift between two clocks from the time stamps of messages.
+"""Estimates the offset and drift between the clocks of two machines from message time stamps.
 
-A message cannot be received before it was sent. With
+Delays between two machines can be measured only if the offset between their clocks is known. A
+message cannot be received before it was sent. With
 
     offset = other clock - local clock,
 
@@ -27,8 +28,8 @@ Invariant:
     - The time stamps prove each error bound, however long the delays are, and however different
       they are in the two directions. No symmetry of the network is assumed.
     - Delays are computed with a smoothed offset (`SlewedOffset`) that never steps, because a
-      step would appear as a jump of all delays. The smoothed offset is continuous and piecewise
-      linear. It reaches each new estimate within SLEW_NS, and then follows the estimated drift.
+      step would appear as a jump of all delays. The smoothed offset reaches each new estimate
+      within SLEW_NS, and then follows the estimated drift.
     - The error bound of the smoothed offset is also valid while the offset still approaches a
       new estimate.
 """
@@ -62,11 +63,10 @@ _WEIGHTING_ROUNDS = 3
 
 
 class OffsetLimit(NamedTuple):
-    """Upper limit (ceiling) or lower limit (floor) of an offset.
+    """Limit of the offset between two clocks, which the time stamps of one message give.
 
-    Each message between two machines limits the offset between their clocks, because a message
-    cannot arrive before it was sent. Messages in one direction give ceilings, those in the
-    other direction floors.
+    A message cannot arrive before it was sent. A message in one direction therefore gives an
+    upper limit (ceiling), one in the other direction a lower limit (floor).
 
     Attributes:
         local_ns: Time on the local clock for which the limit holds, in ns.
@@ -448,14 +448,13 @@ class _SlewSegment:
 
 
 class SlewedOffset:
-    """Smoothed offset over time: the time of another clock minus that of the local clock.
+    """Offset between two clocks (the other one minus the local one) that changes without steps.
 
-    Delays are computed with this offset and not directly with the latest estimate. The estimate
-    differs from the previous one by a small step, which would appear as a step of all delays.
-    The smoothed offset instead approaches each estimate along a straight line.
-
-    Two segments are stored: for the latest estimate, and for the estimate before. The offset is
-    therefore defined only from the start of the earlier segment on.
+    Delays are computed with this offset and not with the latest estimate, because a new
+    estimate would appear as a step of all delays. The smoothed offset instead approaches each
+    estimate along a straight line. Two segments are stored: for the latest estimate, and for
+    the estimate before. The offset is therefore defined only from the start of the earlier
+    segment on.
 
     Args:
         estimate: First estimate. The smoothed offset equals it from the beginning.

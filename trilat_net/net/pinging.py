@@ -1,9 +1,9 @@
-"""Measures the clocks of other members by pings, and repeats queries over a poor network.
+"""Measures the clocks of other processes by pings, and repeats queries over a poor network.
 
-A member is a process that takes part in a session. A ping is a query to which a member replies
-at once, with the readings of its clock when the ping arrived and when the reply was sent. The
-difference between the member's clock and the local clock is then known to half the round trip,
-however large the difference is.
+A ping is a query to which a process replies at once, with the readings of its clock when the
+ping arrived and when the reply was sent. The difference between its clock and the local clock
+is then known to half the round trip, however large the difference is. For example, a round trip
+of 0.4 ms gives the difference to 0.2 ms.
 
 Queries and replies may be lost, or may take longer than the time between two queries. Therefore
 a query is repeated, and replies to the last QUERIES_KEPT copies are accepted.

@@ -4,17 +4,14 @@ They are replies to pings, requests for changes, requests for lost messages, mea
 real arms, reports of dead-man switches, and the targets of operators (the people or programs
 that move arms). Published messages, which everybody receives, are defined in `messages`.
 
-A session is a run in which processes ("sites") each control one arm. In each tick, a period of
-its control loop, a site publishes a record with the result of the tick. The log contains the
-records and events. Therefore the log does not contain the messages of this module, but their
-effects:
+A log contains only published messages: the state of each arm in each period of its control loop
+(its record), and events. The messages of this module appear in a log by their effects:
 
 - A change is logged as an event.
 - A lost message that was sent again is logged like all others.
-- A measurement is logged as `q` and `qd` (joint angles and velocities) of the record of the
-  tick that used it. In each tick, a site uses the newest measurement.
-- A target or force of an operator is logged as `hand` of the records of the ticks in which it
-  acts.
+- A measurement is logged as `q` and `qd` (joint angles and velocities) of the record that used
+  it. In each period, an arm uses the newest measurement.
+- A target or force of an operator is logged as `hand` of the records in which it acts.
 """
 
 import math

@@ -123,10 +123,9 @@ class QualityOfService(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """Attachment of every message, request and response.
+    """Sender, number and time of a message, which ROS 2 programs attach to every Zenoh message.
 
-    ROS 2 programs that communicate over Zenoh attach it, so that receivers can number and time
-    the messages of each sender.
+    Receivers can thus number and time the messages of each sender.
 
     Attributes:
         number: Number of the message, from 1.
@@ -320,7 +319,9 @@ It is limited because reasons contain texts from other programs, which may diffe
 
 
 class Refusals:
-    """Counts the messages from ROS programs that were refused, by the reason.
+    """Counts messages from ROS programs that could not be used, by the reason.
+
+    A faulty ROS program can therefore not stop this process, and the user sees what is wrong.
 
     Args:
         report: Function that receives a sentence when a reason occurs for the first time.
@@ -377,7 +378,9 @@ class Refusals:
 
 
 class TopicPublisher:
-    """Publishes messages on one topic. `Ros2Graph.publisher` creates it.
+    """Publishes messages on one ROS 2 topic, so that ROS programs can subscribe to it.
+
+    `Ros2Graph.publisher` creates it.
 
     Args:
         declared: The publisher object of Zenoh.

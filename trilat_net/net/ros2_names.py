@@ -1,7 +1,7 @@
-"""Checks the names of ROS 2 topics, services and nodes.
+"""Checks the names of ROS 2 topics, services and nodes before they are used.
 
-A name that ROS 2 would not accept is refused with an explanation before it is used, because
-other ROS programs could not subscribe to a topic or call a service with such a name.
+Other ROS programs could not subscribe to a topic, or call a service, with a name that ROS 2
+does not accept. Such a name is therefore refused with an explanation.
 """
 
 import re

@@ -1,11 +1,12 @@
-"""Starts a session: its members find each other and agree on a common start time.
+"""Starts a session: its processes find each other and agree on a common start time.
 
-A member is a process that takes part in the session: a site, which runs one arm and its control
-loop, or a recorder. A tick is one period of the control loop. The first site of the scenario is
-the leader. A normal start has three steps, each of which is an event that a member publishes:
+The processes are called members: sites, which each run one arm and its control loop, and
+recorders. The first site of the scenario is the leader. A normal start has three steps, each of
+which is an event that a member publishes:
 
-1. `epoch`: Once all members are known, the leader proposes an epoch, the time of tick 0, about
-   half a second ahead. The event also lists the members.
+1. `epoch`: Once all members are known, the leader proposes an epoch, the time of the first
+   period (tick 0) of all control loops, about half a second ahead. The event also lists the
+   members.
 2. `ready`: Each member agrees.
 3. `start`: If all members have agreed in time, the leader confirms the epoch. Otherwise it
    proposes another one.

@@ -1,12 +1,13 @@
-"""Schedules the ticks of a running site, and measures the clocks of other sites.
+"""Decides when a running arm computes, and measures the clocks of the other arms.
 
-A site is a process that controls one arm. It executes one tick per period of its control loop.
-Tick k is due k * 10^9 // rate_hz ns after the epoch, the common start time of the session. If
-several sites run on one machine, they wake up at different times in the period, so that they do
-not compete for the processors (`find_turn_ns`).
+The control loop of each arm computes once per period, a tick. Tick k is due k * 10^9 // rate_hz
+ns after the epoch, the common start time of the session. If several loops run on one machine,
+they wake up at different times in the period, so that they do not compete for the processors
+(`find_turn_ns`).
 
-The peers of a site are the other sites whose samples it receives. A sample is the state that a
-site publishes in each tick. The site measures the connection from each peer with four times:
+In each tick, an arm sends its state, a sample, to the arms that follow it. An arm (its process
+is called a site) measures the connection from each peer, an arm that it follows, with four
+times:
 
     t1: this site sends a sample           (this site's clock)
     t2: the peer receives that sample      (the peer's clock)
@@ -19,8 +20,8 @@ was sent. Therefore the offset of the peer's clock (peer minus local) is at most
 least t3 - t4. `offset` computes an estimate from the tightest of these limits.
 
 Invariant:
-    - Ticks are due on the leader's clock, to the nanosecond (law L1 of docs/develop/design.md).
-      The leader is the first site of the scenario.
+    - Ticks are due on the clock of the leader, the first site of the scenario, to the
+      nanosecond (law L1 of docs/develop/design.md).
     - A site on another machine follows the leader's clock by running its own schedule slightly
       faster or slower, by at most SLEW_LIMIT, and never by a step, so that no tick is skipped
       or repeated. If the leader disconnects, the site continues with the last estimate.

@@ -1,14 +1,14 @@
 """Defines the network addresses ("keys") and the numbers of the messages of a session.
 
-A member is a process of a session: a site, which runs one arm, or a recorder. Members exchange
-messages over Zenoh under keys of the form trilat/<session>/<member>/<channel>, where the
+Messages are exchanged over Zenoh under keys of the form trilat/<session>/<member>/<channel>.
+The member is the process that sends them, such as the one that controls the arm "m1", and the
 channel is the kind of the messages. The key of a liveliness token, which shows that a process
-is present, has the channel "alive" and ends with the boot of the process, a random number that
-identifies its start.
+is present, has the channel "alive" and ends with a random number that identifies the start of
+the process (its boot).
 
 Messages of a channel are numbered consecutively, so that a recorder notices lost messages. The
-number of a record, the stored result of one tick, is the tick. Statistics, which are published
-ten times a second, are numbered from 0.
+number of a record, the stored result of one period of a control loop (tick), is the number of
+the tick. Statistics, which are published ten times a second, are numbered from 0.
 """
 
 from collections.abc import Iterator
@@ -55,10 +55,10 @@ STATS_PER_SECOND = 10
 
 
 class KeyParts(NamedTuple):
-    """Parts of a key.
+    """The parts of a key, the text under which a message is published.
 
-    A key is the text under which a message is published. A member is a process that takes part
-    in a session, and a channel is one stream of its messages.
+    The key trilat/<session>/<member>/<channel> names the session, the process that sends the
+    message (the member), and the stream of messages (the channel).
 
     Attributes:
         session: Name of the session.
@@ -106,7 +106,7 @@ def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
 
 
 def key(session: str, member: str, channel: str) -> str:
-    """Returns the key under which a member publishes the messages of one channel.
+    """Returns the network address (key) under which a process publishes one kind of messages.
 
     Args:
         session: Name of the session.

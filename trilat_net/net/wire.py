@@ -1,10 +1,9 @@
-"""Encodes messages, and decodes and checks what arrives or what a log contains.
+"""Encodes messages to bytes, and decodes and checks bytes from the network or from a log.
 
-A payload, the bytes of one message, is a map in the format MessagePack with the field names as
-keys. The classes in `messages` and `requests` define the fields. A site, the process that
-controls one arm, publishes a record (for the log) and a sample (for the other sites) in every
-tick of its control loop. These are encoded directly from the output of the simulation kernel,
-which is faster than through a message object.
+The bytes of a message are a map in the format MessagePack with the field names as keys. The
+classes in `messages` and `requests` define the fields. The two messages that an arm publishes
+in every period of its control loop, the record and the sample, are encoded directly from the
+output of the simulation kernel, which is faster than through a message object.
 
 Invariant:
     - The decoder does not trust its input, because any program on the network can send

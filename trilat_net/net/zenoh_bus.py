@@ -1,8 +1,7 @@
-"""Implements the network connection of a member (`Bus`) over Eclipse Zenoh.
+"""Implements the network connection of a process (`Bus`) over the library Eclipse Zenoh.
 
-A member is a process that takes part in a session, such as the process that controls an arm.
-Members publish messages, and send and answer queries. Zenoh is a library that transports both.
-Only this module and `ros2_graph` import `zenoh`.
+Zenoh transports published messages, queries and their replies between the processes of a
+session. Only this module and `ros2_graph` import `zenoh`.
 
 Invariant:
     - No method waits for the network, because the control loop of an arm calls them.

@@ -163,7 +163,7 @@ def make_zenoh_config(
 
 
 def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested settings in which some values are replaced.
+    """Returns nested settings in which some values are replaced, for example by a user's file.
 
     Args:
         base: The settings.
@@ -304,7 +304,7 @@ when it connects, and then tries again for ever.
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """Content of a user's Zenoh file that has passed the check.
+    """Settings of a user's Zenoh file, after they were checked.
 
     Attributes:
         source: Name of the file, for error messages.

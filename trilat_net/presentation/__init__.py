@@ -1,5 +1,8 @@
 """Presents the results of runs as figures, as a web page, as text and as files for other tools.
 
+The package `analysis` computes the results. This package draws and writes them, for example the
+report of a run (`page`), or the text of `trilat certify` (`certificate_text`).
+
 Invariant:
     - Matplotlib is imported only in this package and in the figures of `studies`, so that
       programs that draw nothing start fast.

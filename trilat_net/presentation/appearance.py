@@ -1,13 +1,13 @@
-"""Defines the colours of the sites, and the widths, type sizes and resolutions of figures.
+"""Defines the colours of the arms, and the widths, type sizes and resolutions of figures.
 
-A site is a process that controls one robot arm. The masters are the arms that people move, and
-the slave is the arm that follows them. A site has the same colour in every figure and on every
-page. The first three colours are the "high contrast" set of Paul Tol's notes on colour: people
-with colour blindness can distinguish them, and they differ in lightness, also in grey print.
+An arm has the same colour in every figure and on every page. The first three colours are the
+"high contrast" set of Paul Tol's notes on colour: people with colour blindness can distinguish
+them, and they differ in lightness, also in grey print.
 
 Invariant:
     - Text in printed figures is 8 pt high throughout.
-    - The slave always has the third colour, for any number of masters.
+    - The slave, the arm that follows the others, always has the third colour, for any number of
+      masters (the arms that people move).
 """
 
 from collections.abc import Sequence

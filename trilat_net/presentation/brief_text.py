@@ -1,9 +1,8 @@
-"""Composes the short texts of `trilat certify` and `trilat metrics`: ten lines each.
+"""Composes the short texts of `trilat certify` and `trilat metrics`, of about ten lines each.
 
-With the option --all, these commands print everything, see `certificate_text` and
-`summary_text`. A metric is a number that describes a run, and a certificate judges whether the
-run was stable. A subject is what a number describes: the run, a site (the process that runs one
-arm), a link or a wall.
+A reader should see within seconds whether a run was stable and how well the arms followed each
+other. With the option --all, these commands print everything, see `certificate_text` and
+`summary_text`.
 
 Invariant:
     - A short text has at most `MOST_LINES` lines, and a further line that names --all. The

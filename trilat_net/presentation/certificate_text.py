@@ -1,13 +1,12 @@
-"""Composes the text of a stability certificate, for the terminal and for the page of a report.
+"""Composes the text that explains whether a run was stable, for the terminal and for a report.
 
-A certificate judges from its log whether a run was stable, and gives the reasons. V is the
-energy function of the stability proof: it must not rise, except by energy that is accounted
-for. `describe_certificate` returns the sentences, which the terminal and the page share. The
-terminal adds tables of the premises, which are conditions of the stability theorem, and of the
-energies that changed V.
+`analysis.certificate` judges the run from its log. `describe_certificate` returns the
+sentences, which the terminal and the report share. The terminal adds tables of the conditions
+of the stability theorem, and of the energies that changed V, the energy function of the
+stability proof.
 
 Invariant:
-    - The terminal and the page have the same sentences.
+    - The terminal and the report have the same sentences.
     - The verdict comes first.
     - The listed energies add up: V at the end is V at the start plus all other entries, up to
       entries that are too small to be listed.
@@ -124,11 +123,11 @@ def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTa
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the text about the pushed twins of a run.
+    """Yields the text about repetitions of a run that received a small push.
 
-    A push is a small disturbance of a twin, a second execution of the run. It shows whether
-    disturbances grow. The text states up to which size a push has a proportional effect, and
-    has a line about each push.
+    A repetition with a push is called a twin, and shows whether small disturbances grow. The
+    text states up to which size a push has a proportional effect, and has a line about each
+    push.
 
     Args:
         twins: The run and its twins.
@@ -142,7 +141,7 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """A sentence of a stability certificate, marked with what it says about stability.
+    """A sentence of a stability certificate, with a mark such as "ok" or "FAIL".
 
     Attributes:
         mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against

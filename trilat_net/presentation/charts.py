@@ -1,17 +1,14 @@
-"""Computes the data of the interactive charts on the page of a report.
+"""Computes the data of the interactive charts in the report of a run, a web page.
 
-A report is a web page about a recorded run. Scripts in the page draw its charts. For this they
-need the signals of the run, such as joint angles and torques. A log, the file with the results
-of the run, has a value per tick (period of the control loop) of 1 ms, which is far too much for
-a page. `ChartBuilder` therefore decimates each signal: it divides the ticks into buckets, and
-keeps the least and the largest value of each bucket.
-
-The result consists of tables of columns, and of charts whose lines refer to these columns by
-index. `page_data` defines the types of the data.
+Scripts in the page draw the charts. For this they need signals of the run, such as joint angles
+and torques. A log typically has a value per millisecond, which is far too much for a page.
+`ChartBuilder` therefore divides the time into intervals, and keeps the least and the largest
+value of each interval (decimation). The result consists of tables of columns, and of charts
+whose lines refer to these columns by index. `page_data` defines the types of the data.
 
 Invariant:
     - Every spike of the log is on the page, because decimation keeps the least and the largest
-      value of a bucket.
+      value of an interval.
     - Every line of a chart has a value to draw. A chart without any line is left out, and
       `_PageCharts.missing` names it, so that the page can say so.
     - Numbers are base64 text of little-endian int32 and float32. This is a third of their

@@ -1,16 +1,16 @@
-"""Draws columns of a log over time: the figures of the method `Log.plot`.
+"""Draws columns of a log over time, as the method `Log.plot` does.
 
-A log is the MCAP file with the results of a run. A site is a process that controls one arm, and
-a column is one number of the site's records, such as the angle of the first joint. Columns are
-selected by name. A name is one of
+A column is one number of an arm, such as the angle of its first joint. For example,
+`log.plot("q1", "tau1")` draws the angle and the torque of the first joint of all arms. A name
+selects one of
 
-- a quantity, such as "q", which selects all columns of the quantity,
+- a quantity, such as "q", which stands for all columns of the quantity,
 - a column without its unit, such as "q1",
 - a column, such as "q1_rad".
 
 Invariant:
     - Names are those of the tables of the log (`Log.table`), and "e", the error.
-    - Each column has a panel. The panel contains a line for each selected site that has the
+    - Each column has a panel. The panel contains a line for each selected arm that has the
       column.
     - An unknown name is an error that states which names exist.
 """

@@ -1,14 +1,12 @@
-"""Concludes a finished run: checks its log, and writes its page and its summary.
+"""Concludes a finished run: checks its log, and writes its report and its summary.
 
-A run is executed by sites, processes that each control one robot arm. A record is the stored
-result of one period of a site's control loop. `conclude` does the work of `trilat report`. The
-check computes the control loops again from the received data in the log, and compares the
-results with the records, bit for bit. The result is a `Conclusion`, whose text the commands
-print after a run.
+`conclude` does the work of `trilat report`. To check the log, it computes the control loops
+again from the received data in the log, and compares the results with the log, bit for bit. The
+result is a `Conclusion`, whose text the commands print after a run.
 
 Invariant:
     - Every claim rests on a new execution of the log, made for this conclusion.
-    - The execution runs in another process while the page is written, so that two processor
+    - The execution runs in another process while the report is written, so that two processor
       cores are used.
 """
 
@@ -41,7 +39,7 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """Everything that a user wants to know about a finished run, with the written files.
+    """The text and the files with which a finished run is presented to its user.
 
     `conclude` creates this object after a run was recorded.
 

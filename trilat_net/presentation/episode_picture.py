@@ -1,8 +1,7 @@
-"""Draws pictures of an episode of a task, as arrays of pixels for a film.
+"""Draws the arms at one time of an episode, as an array of pixels for a film.
 
-An episode is one attempt of a learned program at the task, see `trilat_studies`. A picture
-has a panel per site, the process that controls one arm, and the panel shows the pose of the
-arm. One of the panels also shows the goal of the task.
+An episode is one attempt of a learned program at a task, see `trilat_studies`. A picture has
+one panel per arm. One of the panels also shows the goal of the task.
 
 Invariant:
     - A picture depends only on the poses of the arms, the goal of the task and the title.

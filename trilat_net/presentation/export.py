@@ -1,8 +1,8 @@
 """Exports a log to a file or folder that other tools read, such as CSV, MATLAB or Parquet.
 
-A log is the MCAP file of a run. Each format is a module of the folder `exports` with a constant
-`FORMAT`. `Exporter` finds the format by its name, checks its settings and the output path, and
-writes the export. Formats of tables share `store_tables`.
+Each format is a module of the folder `exports` with a constant `FORMAT`. `Exporter` finds the
+format by its name, checks its settings and the output path, and writes the export. Formats of
+tables share `store_tables`.
 
 Invariant:
     - Numbers that are read back from an export equal those of the log, bit for bit.
@@ -34,7 +34,7 @@ Written = Callable[[int], None]
 
 
 class ExportFormat(NamedTuple):
-    """A format in which logs can be exported, such as CSV.
+    """A file format to which logs can be exported, such as CSV.
 
     It is the constant `FORMAT` of a module in the folder `exports`.
 

@@ -1,9 +1,9 @@
 """Makes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
 
-A log is the MCAP file with the results of a run. A layout is a JSON file that a user imports
-into the viewer. It states which panels are shown, and which numbers of which topics they draw.
-A site is a process that controls one arm. The layout has the plots of the layout for Rerun
-(`rerun_viewer.build_plot_layout`), the modes of the sites, the events, and the arms in space.
+A layout is a JSON file that a user imports into the viewer. It states which panels are shown,
+and which numbers of which topics they draw. The layout has the plots of the layout for Rerun
+(`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events, and the arms
+in space.
 
 The live bridge to ROS 2 and exported bags have other topics than logs. The layout of a log
 therefore has two tabs: one for the log itself, and one for a running session of the same

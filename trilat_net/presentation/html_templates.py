@@ -1,8 +1,8 @@
-"""Renders the HTML templates of this package, in the folder `templates`.
+"""Renders web pages from the Jinja templates in the folder `templates`.
 
 `report.html` is the page that reports a run. The other templates contain macros, each for a
-piece of HTML, such as a table. A module `page_...` computes the values of its section, and the
-template of the section has all of its HTML.
+piece of HTML, such as a table. A module `page_...` computes the values of its section of the
+report, and a template has all of the HTML.
 
 Invariant:
     - Templates escape every value that is a plain string. Only values of the class `Markup` are

@@ -1,11 +1,8 @@
-"""Composes the text of a linear analysis, as the command `trilat linear` prints it.
+"""Composes the text that `trilat linear` prints: whether small motions of coupled arms decay.
 
-A linear analysis linearises the coupled arms at a pose of rest, and computes whether small
-motions decay. Operators are the people or programs that move the arms, and the key of a
-scenario is a value such as a gain or a delay. The text has the equilibrium, the delays, a table
-of the rightmost roots of the characteristic equation, the verdict, the largest stable delay,
-the ports at which operators hold the arms, and the values of scenario keys at which stability
-changes.
+The text has the pose of rest at which the arms are linearised, the delays, a table of the
+rightmost characteristic roots, the verdict, the largest stable delay, what operators feel, and
+the values of settings, such as gains, at which stability changes.
 
 Invariant:
     - Every number has its unit.

@@ -1,9 +1,8 @@
 """Composes the text of `trilat log info`, which describes what log files contain.
 
-A log is the record of a run in one or more MCAP files. The text has these parts:
+The text has these parts:
 
-- The session, its sites (processes that each run one arm), and the links between them, if
-  trilat-net wrote the log.
+- The session, its arms, and the network connections between them, if trilat-net wrote the log.
 - The channels, which are the series of messages in the files.
 - The number of messages, as counted by the process that wrote the log.
 - A line for each file.

@@ -1,19 +1,12 @@
 """Writes the report of a recorded run: a web page and a file with the numbers of the run.
 
-A run is a session of two or more sites, each of which is a process that controls one arm. The
-log of the run is an MCAP file. `write_report` computes the numbers of the run from the log,
-draws the figures that explain whether the run was stable, and writes two files:
+`write_report` computes the numbers of the run from its log, draws the figures that explain
+whether the run was stable, and writes two files:
 
-- `report.html`, a page for people. `render_report` fills the template
-  `templates/report.html`.
-  Each section of the page comes from one module `page_...`, in the order of the page:
-  `page_summary`, `page_charts` and `page_leaders` (the first screen), `page_charts` (motion),
-  `page_timeline`, `page_links`, `page_sites`, `page_certificate`, `page_sites` (the loops) and
-  `page_origin`.
+- `report.html`, a page for people. `render_report` fills the template `templates/report.html`.
+  Each section of the page comes from one of the modules `page_...`. Interactive charts are
+  drawn in the browser by scripts, from data that `charts.ChartBuilder` computes.
 - `summary.json`, the same numbers for programs.
-
-The interactive charts are drawn in the browser by scripts. `charts.ChartBuilder` computes their
-data, which the page contains as JSON.
 
 Invariant:
     - The page is a single file that contains its images, styles and scripts. It loads nothing

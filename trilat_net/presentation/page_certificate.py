@@ -1,7 +1,7 @@
-"""Renders the section of a report's page that explains whether the run was stable.
+"""Renders the section of a report that explains whether the run was stable.
 
-A certificate judges from its log whether a run was stable, and gives the reasons. V is the
-energy function of the stability proof.
+The section has the sentences of `trilat certify`, and figures of V, the energy function of the
+stability proof.
 
 Invariant:
     - The sentences are those that `trilat certify` prints, with longer names of the checks.

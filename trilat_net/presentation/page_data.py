@@ -1,8 +1,8 @@
-"""Defines the data that a report's page contains for its scripts `report.js` and `arms.js`.
+"""Defines the data that the web page of a report contains for its scripts.
 
-A report is a web page about a recorded run of several robot arms. The page of a report contains
-one `PageData` as JSON. `charts.ChartBuilder` computes it, and the scripts draw charts and arms
-from it in the browser. Long columns of numbers are encoded as base64.
+The scripts `report.js` and `arms.js` draw charts and moving arms in the browser. They read one
+`PageData` as JSON, which `charts.ChartBuilder` computes. Long columns of numbers are encoded as
+base64.
 
 Invariant:
     - These types are the contract between the program and the scripts. A script reads no field
@@ -111,7 +111,7 @@ class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": 
 
 
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
-    """A chart of the page over the time of the run.
+    """A chart of the report over the time of the run, such as the joint angles.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.

@@ -1,10 +1,10 @@
-"""Renders the pieces of HTML from which the sections of a report's page are made.
+"""Renders small pieces of HTML, such as tables, for the report of a run.
 
-A report is a web page about a recorded run. A site is a process that controls one robot arm,
-and a link is the directed connection from one site to another.
+The modules `page_...` compose the sections of the report from these pieces.
 
 Invariant:
-    - Every function returns `Markup`. A plain string that becomes a part of it is escaped.
+    - Every function that renders HTML returns `Markup`. A plain string that becomes a part of
+      it is escaped.
     - A reader who uses the keyboard can scroll every region that scrolls sideways.
 """
 

@@ -1,8 +1,8 @@
-"""Renders who leads each slave over time, as thin bars below the moving arms of a report.
+"""Renders bars in a report that show which user leads the slave arm at each time.
 
-A site is a process that controls one arm. A slave follows its peers, the other sites, each with
-a weight: the dominance factor. The peer with the larger factor leads. The factors may change
-during a run, by the scenario or by a command.
+A slave arm may follow several master arms, each with a weight, the dominance factor. The master
+with the larger factor leads. The factors may change during a run, for example when a trainer
+takes over from a trainee. The bars stand below the moving arms of the report.
 
 Invariant:
     - The factors are those with which the slave computed, from the scenario and the records.

@@ -1,9 +1,8 @@
-"""Renders the section of a report's page about communication: delays, losses and clocks.
+"""Renders the section of a report about communication: delays, losses and clocks.
 
-A link is the directed connection from one site to another, and a site is a process that
-controls one robot arm. A sample is the state that a site publishes in a tick of its control
-loop. The age of a sample is the time since it was sent. It is the delay that the controller of
-the receiver experiences.
+A link is the directed connection from one arm to another. Over it, an arm sends its state in
+each period of its control loop, which is called a sample. The age of a sample is the time since
+it was sent, and thus the delay that the controller of the receiver experiences.
 
 Invariant:
     - A sentence with the main numbers precedes the tables, and each table has a legend.

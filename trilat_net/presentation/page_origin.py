@@ -1,4 +1,4 @@
-"""Renders the section of a report's page that says where a run comes from.
+"""Renders the section of a report that says how the run was made and how to repeat it.
 
 It contains the description of the scenario (the experiment), the facts about the recording, the
 commands that check and repeat the run, the assumptions, and the versions of the software.

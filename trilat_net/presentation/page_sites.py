@@ -1,7 +1,6 @@
-"""Renders the sections of a report's page about the sites: their motion, and their loops.
+"""Renders the sections of a report about each arm: its motion, and the timing of its loop.
 
-A site is a process that controls one robot arm. A record is the stored result of one tick of
-the site's control loop.
+A record is the stored state of an arm in one period (tick) of its control loop.
 
 Invariant:
     - Each section begins with a sentence, and each table has a legend.

@@ -1,9 +1,8 @@
-"""Renders the first lines of a report: the judgement of the run, its checks and key numbers.
+"""Renders the first lines of a report: the stability judgement, its checks and key numbers.
 
-A report is a web page about a recorded run of several robot arms. A site is a process that
-controls one arm. Its error e is the difference between its motion and the motion that it
-should follow. The first lines let a reader decide within seconds whether the run needs a closer
-look.
+They let a reader decide within seconds whether the run needs a closer look. One of the numbers
+is the tracking error e, the difference between the motion of an arm and the motion that it
+should follow.
 
 Invariant:
     - The judgement never stands alone beside a number that seems to contradict it. A sentence

@@ -1,8 +1,8 @@
-"""Renders what happened in a run, in the order of time, as sentences on the page of a report.
+"""Renders the section of a report that lists what happened in the run, in order of time.
 
-A site is a process that controls one robot arm. Its mode is what it does in a tick of its
-control loop: it follows its peers, holds its position, brakes or returns. A change is a command
-that alters the run, such as another delay of a link.
+For example, a command changed the network delay at 5 s, or an operator pushed an arm at 7 s.
+The section also lists alarms, and changes of an arm's mode: it follows the other arms, holds
+its position, brakes or returns.
 
 Invariant:
     - Every sentence comes from the scenario or from a record.

@@ -1,10 +1,10 @@
 """Defines the signals that only figures and pages show, and reduces signals for plots.
 
-A signal is an array with a row for each record (the result of one tick of the arm's control
-loop). `analysis.site_signals` has the signals that metrics and summaries use too. For plots,
-the rows are reduced: each bucket of records keeps the minimum and the maximum of each column,
-so that a spike of a single tick at 1 kHz stays visible. A gap in the records that is wider than
-a bucket becomes a row of NaN, so that no line is drawn across it.
+A signal is an array with one row for each period of the control loop. A run of a minute at 1
+kHz has 60 000 rows, too many for a plot. Therefore the rows are reduced: each bucket of records
+keeps the minimum and the maximum of each column, so that a spike of a single period stays
+visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no line
+is drawn across it. `analysis.site_signals` has the signals that metrics and summaries use too.
 
 Invariant:
     - Empty logs give empty arrays.
@@ -124,7 +124,7 @@ class _DecimatedTrace(NamedTuple):
 def extreme_rows(values: Array, buckets: int) -> Ints:
     """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
 
-    The rows are divided into intervals with equal numbers of rows (buckets). In each bucket the
+    The rows are divided into buckets, intervals with equal numbers of rows. In each bucket the
     rows with the largest and the smallest value of each column are kept. The first and the last
     row are kept as well. NaN is never an extreme. A bucket in which a column is NaN throughout
     keeps its first row.

@@ -1,11 +1,10 @@
-"""Writes the sentences about the premises of a stability certificate.
+"""Writes the sentences that say whether each condition of the stability theorem holds.
 
-A premise is a condition of the stability theorem, such as constant delays. The package
-`analysis` computes its quantities, and the functions in `DESCRIBERS` state them for people. A
-site is the process that runs one arm.
+A condition, such as constant delays, is called a premise. The package `analysis` computes the
+numbers that decide it, and the functions in `DESCRIBERS` state them for people.
 
 Invariant:
-    - A sentence lists at most `MAX_LISTED_NAMES` sites, links or joints, and counts the others.
+    - A sentence lists at most `MAX_LISTED_NAMES` arms, links or joints, and counts the others.
     - Each class of `premise_quantities` has one function here, in `DESCRIBERS`.
 """
 

@@ -1,9 +1,8 @@
 """Shows a log in the Rerun viewer, an interactive program for plots and 3D scenes.
 
-A log is the MCAP file with the results of a run. A site is a process that controls one arm.
 Rerun reads the data of a log from its MCAP file, in channels with standard messages of ROS 2,
 and reads the layout of its views from another file, the "blueprint". `open_rerun` prepares both
-files and starts Rerun. The layout consists of pages of plots, with a column per site and a row
+files and starts Rerun. The layout consists of pages of plots, with a column per arm and a row
 per quantity. The extra `view` of the package installs Rerun.
 
 Invariant:

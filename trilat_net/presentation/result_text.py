@@ -1,8 +1,7 @@
 """Represents the text of a result as blocks, for the terminal, plain text and HTML.
 
-A result is what a command has computed, such as the measured numbers of a run. Its text
-consists of blocks. A block is a line, a line that begins with a mark such as a green "ok"
-(`MarkedText`), or a table (`TextTable`).
+The text of a result consists of blocks. A block is a line, a line that begins with a mark such
+as a green "ok" (`MarkedText`), or a table (`TextTable`).
 
 A class of results may have a method `blocks` that returns its blocks. For other classes, a
 function in this folder composes the blocks, and `_COMPOSERS` lists these functions by the name
@@ -40,7 +39,7 @@ MARKS["note"] = "note"
 
 
 class TextTable(NamedTuple):
-    """A table of texts, which can be rendered for a terminal, as Markdown or as HTML.
+    """A table of texts that can be printed, or rendered as Markdown or HTML.
 
     Attributes:
         headers: Header of each column. If all are empty, the table has no header line.
@@ -191,7 +190,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 
 class MarkedText(NamedTuple):
-    """A line of printed text behind a mark that states a result, such as a green "ok".
+    """A line of text that begins with its result as a mark, such as a green "ok".
 
     Attributes:
         mark: The mark in Rich's markup, as in "[green]ok[/green]". Empty for no mark.

@@ -1,11 +1,10 @@
-"""Renders the records of a site as HTML, as Jupyter notebooks display them.
+"""Renders the recorded states of an arm as HTML, which Jupyter notebooks display.
 
-A site is a process that controls one arm. A record is the stored result of one tick of the
-site's control loop. The HTML has a heading and a table that summarises each quantity over the
-run.
+If `log["m1"]` is the last line of a notebook's cell, the notebook shows this HTML: a heading
+and a table that summarises each quantity over the run.
 
 Invariant:
-    - The table has only quantities that the records of this site contain.
+    - The table has only quantities that the records of this arm contain.
     - Rendering does not change the records.
 """
 

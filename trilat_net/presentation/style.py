@@ -1,13 +1,12 @@
-"""Defines the common style of all figures, and draws their common parts.
+"""Gives all figures a common style, and draws the parts that they share.
 
-A figure looks the same wherever it appears: each site, a process that controls one arm, has its
-own colour; sites beyond the number of colours are told apart by dashes. This module provides
-the lines, axes, panels and legends in this style, and writes figures to files.
+A figure looks the same wherever it appears: each arm has its own colour, and arms beyond the
+number of colours are distinguished by dashes. This module provides the lines, axes, panels and
+legends in this style, and writes figures to files.
 
 Most figures show signals over the time of a run. `TimeFigure` draws them: panels with a line
-per site, markers, a time axis and a legend. The markers show when a site did not follow its
-peers (it held, braked or returned), and when a change was applied, such as another delay of a
-link.
+per arm, a time axis and a legend. Markers show when an arm did not follow the others (it held,
+braked or returned), and when a change was applied, such as another network delay.
 
 Invariant:
     - Matplotlib's global state stays unchanged, so that users' own figures keep their style.
@@ -136,7 +135,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels, parts of the figure with axes of their own.
+    """Adds a grid of panels (parts of the figure with axes of their own) to a figure.
 
     Args:
         figure: The Matplotlib figure.

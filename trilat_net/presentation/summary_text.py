@@ -1,9 +1,7 @@
 """Composes the text that commands print about a run, a live session and this machine.
 
-A run is executed by processes that each control one robot arm. A live session is a run that
-takes place over a network. Each function `compose_...` turns the result of one command into
-blocks, which `terminal_output` prints. A block is a line, a line that begins with a mark such
-as "ok", or a table. The results are about:
+Each function `compose_...` turns the result of one command into lines and tables, which
+`terminal_output` prints. The results are about:
 
 - a run: its summary, measured numbers, checks of its log, recovery of its log, and repeated
   execution,

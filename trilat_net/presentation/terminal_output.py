@@ -2,14 +2,14 @@
 
 Texts may come from files or from other computers on the network. Such a text could contain
 control characters that move the cursor or hide other texts. Therefore every text passes through
-this module.
+this module, which makes it safe (`untrusted_text`).
 
 Invariant:
     - No control character reaches a terminal, whatever the origin of a text: `TextConsole` and
       `print_line` escape control characters.
     - Text from a file or from another process also passes `sanitize`, which limits its length.
-    - Code below the commands does not know the progress bar. It calls a function with
-      (done, total).
+    - Code below the commands does not know the progress bar. It calls a function with (done,
+      total).
     - The top of this module imports only Rich, so that `trilat --help` stays fast.
 """
 

@@ -1,11 +1,12 @@
-"""Writes the sentences about the energy function V in a stability certificate.
+"""Writes the sentences about V, the energy function of the stability proof, for people.
 
-V is the energy function of the stability proof, and a premise is a condition of that proof. A
-site is the process that runs one arm. `analysis` finds the facts, which are names and numbers.
+`analysis` computes whether and when V rose, as names and numbers. For example, this module
+writes that V rose by 0.2 J at 3.1 s, or which condition of the theorem failed.
 
 Invariant:
     - Each class of `VerdictFacts` has one function here, in `DESCRIBERS`.
-    - A sentence that names a premise that fails says in plain words what the premise requires.
+    - A sentence that names a condition (premise) that fails says in plain words what the
+      condition requires.
     - The theorem is named with its own premises of continuous time, which no log can show.
 """
 

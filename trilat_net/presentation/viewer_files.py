@@ -1,6 +1,6 @@
-"""Writes files beside a log with which viewers show it: for Foxglove, Lichtblick and RViz.
+"""Writes configuration files with which Foxglove, Lichtblick and RViz show the arms of a log.
 
-A log is the MCAP file with the results of a run. A bag is a file of standard messages of ROS 2
+The files lie beside the log. Some of them serve a bag, a file of standard messages of ROS 2
 (Robot Operating System), into which a log can be exported. A bag has the topics that the live
 bridge to ROS 2 publishes during a session.
 

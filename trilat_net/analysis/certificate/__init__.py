@@ -1,5 +1,7 @@
-"""Checks with a recorded run that the stability theorem of the paper holds for it.
+"""Judges from the log of a run whether it was stable, and gives the reasons.
 
-The certificate checks the premises (conditions) of the theorem, evaluates the energy function V
-of its proof, verifies that the energy balance of the records is closed, and states a verdict.
+The judgement is called a stability certificate, and rests on the stability theorem of the
+paper. The theorem says that an energy function V of all arms never rises, unless an operator
+supplies energy. The package checks whether the conditions of the theorem hold, computes V from
+the log, and checks that every change of V has a known cause.
 """

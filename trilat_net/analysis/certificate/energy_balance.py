@@ -1,19 +1,20 @@
 """Checks that the energy of each arm, and of all arms together, changes only by known causes.
 
-A site is the process that runs one arm. V_i is the energy function of site i in the stability
-proof, which `energy_terms` defines, and V_i(0) its value at the start. For each site:
+If the records of a run come from the equations that the log states, their energies add up,
+whatever the operators do. This module checks the sums. V_i is the energy function of arm i in
+the stability proof, which `energy_terms` defines. For each arm:
 
     V_i - V_i(0) + dissipation + transfer - work = 0
 
-The dissipation is the energy that the controller of the site has removed. The transfer is the
-energy that the site has given to the sites that follow it. The work is the energy that
-operators and environments have supplied. In the weighted sum over all sites, the transfers
-cancel, so that the total energy function V satisfies
+The dissipation is the energy that the controller has removed, and the transfer is the energy
+that the arm has given to the arms that follow it. The work is the energy that operators and
+environments have supplied. The transfers cancel in the weighted sum over all arms, so that the
+total energy function V satisfies
 
     V - V(0) + dissipation - work = 0
 
-The weights are called beta and depend on the dominance factors, with which the sites follow
-each other. Both equations hold for any behaviour of the operators.
+The weights beta follow from the dominance factors, the weights with which the arms follow each
+other.
 
 Invariant:
     - If these sums do not vanish, the records were not produced by the equations that the log

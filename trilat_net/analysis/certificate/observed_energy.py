@@ -1,19 +1,20 @@
 """Checks the energies that a control law declares against the records of a run.
 
 Some control laws prove passivity by counting energy: they keep energy in stores (tanks), or
-track the energy that travels between the sites, the processes that run one arm each. Such a law
-declares these energies for every tick of its control loop. This module computes the same
-energies independently, from the recorded torques and motion, and compares them:
+track the energy that travels between the arms. Such a law declares these energies for every
+tick (period of its control loop). A wrong program could declare a wrong energy. Therefore this
+module computes the same energies independently, from the recorded torques and motion, and
+compares them:
 
-- Energy of the connection (line) from site j to site i: the energy that the law of j sent,
-  minus the energy that the law of i received.
+- Energy of the connection from arm j to arm i: the energy that the law of j sent, minus the
+  energy that the law of i received.
 - Energy that the arm gives to its law: minus the sum of u_k'(q_{k+1} - q_k) over all ticks k.
   Here u_k is the torque during tick k, and q_k are the joint angles.
 
 Invariant:
     - A declared energy counts as evidence only if it agrees with the computed energy.
-    - The verdict is negative if the energy of a line or store is ever below zero. It is also
-      negative if the total energy that a law has dissipated ever decreases.
+    - The verdict is negative if the energy of a connection or store is ever below zero. It is
+      also negative if the total energy that a law has dissipated ever decreases.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -124,7 +125,10 @@ class _LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Verdict on the energies that control laws declare, computed by `ObservedEnergy.of_log`.
+    """Judgement of a run by the energies that its control laws declare.
+
+    `ObservedEnergy.of_log` computes it, and compares the energies with recorded torques and
+    motion.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.

@@ -1,8 +1,10 @@
-"""The quantities by which the conditions of the stability theorem are judged, one class each.
+"""Defines the numbers and names that show whether a condition of the stability theorem holds.
 
-A site is the process that runs one arm, and the sites follow each other. A condition of the
-theorem is called a premise. `premises` and `observed_energy` compute the quantities from the
-log of a run. The package `presentation` writes the sentences about them.
+A condition of the theorem is called a premise. For example, the premise "the delays are
+constant" is judged by `DelayQuantities`, which has the delays of the network links. `premises`
+and `observed_energy` compute these classes from the log of a run. The package `presentation`
+writes the sentences about them, so that a sentence can be changed without touching the
+analysis.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.
@@ -35,7 +37,9 @@ class FunctionalObstacle(Enum):
 
 
 class MissingFunctional(NamedTuple):
-    """Group of sites whose arms have no energy function V, all for the same reason.
+    """Sites whose arms have no energy function V, all of them for the same reason.
+
+    A site is the process that runs one arm.
 
     Attributes:
         obstacle: The reason.
@@ -49,7 +53,9 @@ class MissingFunctional(NamedTuple):
 
 
 class LawQuantities(NamedTuple):
-    """Evidence for the premise that V exists, as each site has an adaptive law.
+    """Evidence for the condition that every control law is one for which V exists.
+
+    V, the energy function of the stability proof, exists for adaptive laws only.
 
     Attributes:
         missing: Sites without V, grouped by the reason. The premise holds if there are none.
@@ -85,9 +91,10 @@ class ParameterQuantities(NamedTuple):
 
 
 class GainQuantities(NamedTuple):
-    """Evidence for the premise that the gain Kd is equal at all sites, up to a factor each.
+    """Evidence for the condition that the damping gain Kd of all sites is equal up to a factor.
 
-    The factors can be balanced by the weights of the sites in V. Other differences cannot.
+    For example, Kd may be twice as large at one site, because the weights of the sites in V
+    balance the factor. They cannot balance other differences.
 
     Attributes:
         Kd: Gain of each site per joint, in N m s/rad. In task space per coordinate, in N s/m.
@@ -146,9 +153,9 @@ class DominanceQuantities(NamedTuple):
 
 
 class AgeRange(NamedTuple):
-    """Range of the ages of the samples that one site uses of another one.
+    """Range of the ages of the states that one site uses of another one.
 
-    The age is the time since the sample was sent: the delay that the control law sees.
+    The age is the time since the state was sent: the delay that the control law experiences.
 
     Attributes:
         peer: Site that sends the samples.
@@ -164,7 +171,7 @@ class AgeRange(NamedTuple):
 
 
 class DelayQuantities(NamedTuple):
-    """Evidence for the premise that the delay of every link is constant.
+    """Evidence for the condition that the delay of every network link is constant.
 
     Attributes:
         varying: Ages on the links whose delay varies. The premise holds if there are none.
@@ -176,7 +183,7 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """Interval in which a site did not follow its peers, contrary to a premise.
+    """Interval of time in which a site did not follow its peers, as the theorem requires it to.
 
     Attributes:
         site: Name of the site.
@@ -205,7 +212,7 @@ class FollowingQuantities(NamedTuple):
 
 
 class CutTorque(NamedTuple):
-    """A site whose actuators could not deliver the torque that its control law demanded.
+    """A site whose motors could not deliver the torque that its control law demanded.
 
     Attributes:
         site: Name of the site.
@@ -232,7 +239,7 @@ class TorqueQuantities(NamedTuple):
 
 
 class TouchedStop(NamedTuple):
-    """A site whose arm ran into the mechanical stops of its joints.
+    """A site whose arm reached the mechanical end stops of its joints.
 
     Attributes:
         site: Name of the site.
@@ -246,7 +253,7 @@ class TouchedStop(NamedTuple):
 
 
 class StopQuantities(NamedTuple):
-    """Evidence for the premise that no joint touched the mechanical stops that limit its range.
+    """Evidence for the condition that no joint touched its mechanical end stops.
 
     Attributes:
         touched: Sites whose arms touched their stops. The premise holds if there are none.
@@ -256,9 +263,11 @@ class StopQuantities(NamedTuple):
 
 
 class AxisQuantities(NamedTuple):
-    """Evidence for the premise that followed sites follow along the same axes.
+    """Evidence for the condition that sites which follow each other follow along the same axes.
 
-    It concerns sites in task space, whose end effectors may leave some axes free.
+    In task space, an end effector may follow along some axes only, for example not in
+    orientation. The condition fails if a site follows an axis that the followed site leaves
+    free.
 
     Attributes:
         faults: Pairs (follower, followed site) with an axis that only the follower follows.
@@ -284,7 +293,7 @@ class SingularPoseQuantities(NamedTuple):
 
 
 class Supply(NamedTuple):
-    """Energy that operators and environments supplied, and the motion without them at the end.
+    """Energy that operators and environments supplied, and how long nobody pushed at the end.
 
     Attributes:
         sources: Names of the sources.
@@ -338,7 +347,9 @@ class RecordQuantities(NamedTuple):
 
 
 class AbsentSpan(NamedTuple):
-    """A span of time in which a site was absent from the session and executed no ticks.
+    """Interval of time in which a site was absent from the session and executed no ticks.
+
+    For example, its process was stopped and started again.
 
     Attributes:
         site: Name of the site.
@@ -352,9 +363,9 @@ class AbsentSpan(NamedTuple):
 
 
 class PresentStretch(NamedTuple):
-    """A stretch of time between two absences, in which all sites were present.
+    """Interval of time between two absences, in which all sites were present.
 
-    The stability theorem can apply to a stretch only from the time at which all sites follow
+    The stability theorem can apply only from the time in the interval at which all sites follow
     again.
 
     Attributes:
@@ -386,9 +397,10 @@ class PresenceQuantities(NamedTuple):
 
 
 class BooksQuantities(NamedTuple):
-    """Evidence for the premise that the energies that control laws declare add up.
+    """Evidence for the condition that the energies which control laws declare are right.
 
-    The declared energies must follow from the recorded torques and velocities.
+    The declared energies are compared with those that follow from recorded torques and
+    velocities.
 
     Attributes:
         site: Site whose law has the largest error.
@@ -402,10 +414,10 @@ class BooksQuantities(NamedTuple):
 
 
 class BookedTorqueQuantities(NamedTuple):
-    """Evidence for the premise that control laws count the torque that the arms received.
+    """Evidence for the condition that control laws count the torque that the arms received.
 
-    A law that counts the torque it demanded, although the actuator delivered less, has wrong
-    energies.
+    If a torque was cut off at the limit of a motor, a law that counts the demanded torque
+    declares wrong energies.
 
     Attributes:
         cut: Sites whose torque was cut off at the limit of their actuators.
@@ -417,10 +429,10 @@ class BookedTorqueQuantities(NamedTuple):
 
 
 class SamplingQuantities(NamedTuple):
-    """Evidence for the premise that arms receive little energy that their laws do not count.
+    """Evidence for the condition that arms receive little energy that their laws do not count.
 
-    A torque is held over a tick while the arm moves on. The law, which sees the arm at ticks
-    only, does not count the energy that arises between.
+    Between two control periods the torque is constant while the arm moves on. The law, which
+    sees the arm once per period only, does not count the energy that this supplies.
 
     Attributes:
         site: Site that received most of this energy.

@@ -1,24 +1,23 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
-A site is the process that runs one arm, and the sites follow each other's motion. The theorem
-says that an energy function V of all arms never rises, unless an operator supplies energy. Its
-proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
+The theorem says that an energy function V of all arms never rises, unless an operator supplies
+energy. Its proof is in docs/theory/theorem.md. It has conditions, called premises:
 
-- The delays of the links are constant.
-- The dominance factors, the weights with which the sites follow each other, are constant. Every
-  site follows every other site, at least through further sites.
-- The damping gain Kd is the same at every site, up to a factor per site.
-- Every site uses the adaptive law, which estimates the parameters theta of its arm.
+- The network delays are constant.
+- The dominance factors, the weights with which the arms follow each other, are constant. Every
+  arm follows every other arm, at least through further arms.
+- The damping gain Kd is the same at every arm, up to a factor per arm.
+- Every arm uses the adaptive law, which estimates the parameters theta of the arm.
 - No operator moves an arm, or the operators are passive with respect to the filtered error r.
   This is the joint velocity plus a gain Lambda times the position error.
 
-The module also collects how many records were available.
+The module also finds the times for which records are missing.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      it. The module has no sentences: the package `presentation` writes them.
+      it. The package `presentation` writes the sentences.
     - Missing information never makes a run stable. The judgement stays open if too many records
-      are missing, or if the run was repeated with the recorded motion of some sites.
+      are missing, or if the run was repeated with the recorded motion of some arms.
     - A log that was changed after it was written does not pass.
 """
 

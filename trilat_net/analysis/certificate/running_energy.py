@@ -1,9 +1,9 @@
-"""Computes the energy of all arms in the stability proof while a session runs.
+"""Computes the energy function V of all arms while a session runs.
 
-The energy function V of the stability proof is defined in `energy_terms`. After a session,
-`trilat certify` computes V from the whole log. This module computes V, and the work of the
-operators, during the session with the same functions. It receives a record of each arm in every
-tick of its control loop, and keeps the newest records of every arm in a window.
+A person who watches a running session can thus see whether the energy of the arms falls, as the
+stability proof demands (`energy_terms` defines V). After the session, `trilat certify` computes
+V from the whole log. `RunningEnergy` uses the same functions, but receives one record of an arm
+at a time. It keeps only the newest records of each arm, in a `RecordWindow`.
 
 Invariant:
     - V equals the result of `trilat certify` at the same times, up to rounding. For this the
@@ -11,7 +11,7 @@ Invariant:
     - Nothing is extrapolated. V at a time is computed when all records up to it have arrived,
       and is left out if records are lost.
     - The size of a window is bounded.
-    - A record may arrive late, out of order or twice. Ticks without a record are marked.
+    - A record may arrive late, out of order or twice.
 """
 
 from collections.abc import Iterable, Mapping

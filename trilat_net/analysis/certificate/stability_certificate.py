@@ -1,22 +1,22 @@
-"""Issues the stability certificate of a recorded run.
+"""Judges from a log whether the run was stable, and explains the judgement.
 
-A certificate answers whether the run was stable, and why. The judgement is based on:
+`certify` is the entry point, and `Certificate` its result. A certificate combines:
 
 - the conditions (premises) of the stability theorem, which `premises` checks;
 - the energy function V of the stability proof, which must not rise unless an operator or an
   environment supplied the energy;
 - the motion at the end of the run, which `run_end` judges without any theory;
-- small pushes in repeated executions (twins) of the run, if they were computed;
+- repetitions of the run with small disturbances, if they were computed;
 - the energies that control laws declare, which `observed_energy` checks;
 - how complete the records are, and whether the log was changed.
 
 Invariant:
-    - A rise of V beyond the work of operators and environments is reported with its time, its
-      amount and the sources of the energy, because the theorem excludes it.
-    - Energy without any source means that the equations stated in the log did not produce the
+    - A rise of V beyond the work of operators and environments is reported with its time and
+      amount, because the theorem excludes such a rise.
+    - Energy without any cause means that the equations stated in the log did not produce the
       records. The energy balance is then called broken.
-    - Anything that a log cannot decide is stated. If V does not exist, the end of the run
-      alone decides.
+    - Anything that a log cannot decide is stated. If V does not exist, the end of the run alone
+      decides.
     - Keys of the JSON output end in their unit, and unknown values are null.
 """
 

@@ -1,13 +1,14 @@
-"""The facts from which a stability certificate judges the energy function V, without sentences.
+"""Defines the possible findings about the energy function V of a run, one class each.
 
-V is the energy function of the stability proof. A site is the process that runs one arm.
-`stability_certificate` finds the facts, and the package `presentation` writes the sentences
-about them.
+V is the energy function of the stability proof, which must not rise by itself. For example,
+`FunctionalRise` says when V rose and by how much, and `NoFunctional` for which arms V does not
+exist. `stability_certificate` selects the finding, and the package `presentation` writes the
+sentence about it.
 
 Invariant:
-    - The facts contain only names and numbers, no sentence.
-    - Each verdict has exactly one class of facts. An empty collection means that nothing of
-      this kind was found in the run.
+    - A finding contains only names and numbers, no sentence.
+    - Each verdict has exactly one finding. An empty collection means that nothing of this kind
+      was found in the run.
 """
 
 from enum import Enum, auto
@@ -19,7 +20,7 @@ from .premise_quantities import MissingFunctional, PremiseQuantities
 
 
 class StabilityFinding(Enum):
-    """What the energy function V of the stability proof shows about a run.
+    """Possible results of examining V, the energy function of the stability proof, over a run.
 
     The names of the members, in small letters, are the values of `verdict` in the JSON output.
     """
@@ -37,10 +38,10 @@ class StabilityFinding(Enum):
 
 
 class FunctionalRise(NamedTuple):
-    """The largest rise of the arms' total energy that nobody supplied from outside.
+    """Largest rise of the energy function V that nobody supplied from outside.
 
-    The energy is the function V of the stability proof, less the work of operators and
-    environments. It must not rise by itself.
+    The work of operators and environments is subtracted from V, the total energy of the arms in
+    the stability proof. What remains must not rise by itself.
 
     Attributes:
         from_s: Time of the minimum of V before the rise, in s.
@@ -57,7 +58,9 @@ class FunctionalRise(NamedTuple):
 
 
 class UnsuppliedGrowth(NamedTuple):
-    """A growth of V that no operator and no environment supplied, at the end of a run.
+    """Finding that V grew at the end of a run by energy that nobody supplied from outside.
+
+    V is the energy function of the stability proof, which must not rise by itself.
 
     Attributes:
         energy_j: Size of the growth, in J.
@@ -69,7 +72,9 @@ class UnsuppliedGrowth(NamedTuple):
 
 
 class NoFunctional(NamedTuple):
-    """V does not exist for some arms.
+    """Finding that the energy function V does not exist for some arms.
+
+    For example, V exists only for certain control laws. The run is then judged without V.
 
     Attributes:
         missing: Sites of these arms, grouped by the reason.
@@ -79,7 +84,10 @@ class NoFunctional(NamedTuple):
 
 
 class RecordGap(Enum):
-    """Reason why V cannot be computed although it exists: records are missing."""
+    """Reason why the energy function V cannot be computed although it exists.
+
+    Each reason is that records of the run are missing.
+    """
 
     NO_COMMON_TIME = auto()
     """There is no time at which every site has records."""
@@ -88,7 +96,10 @@ class RecordGap(Enum):
 
 
 class UnclosedBalance(NamedTuple):
-    """The energy balance of a site does not close.
+    """Finding that the energy of an arm changed by more than the known causes explain.
+
+    The energies of a run that obeys the equations of the log add up. If they do not, the log or
+    the simulation is wrong, or the control period is too long.
 
     Attributes:
         site: Site with the largest error.
@@ -109,7 +120,7 @@ class UnclosedBalance(NamedTuple):
 
 
 class WrongTorque(NamedTuple):
-    """Recorded torques of a site differ from its control law, Eq. (13).
+    """Finding that the recorded torques of an arm are not those of its control law, Eq. (13).
 
     Attributes:
         site: Name of the site.
@@ -123,7 +134,10 @@ class WrongTorque(NamedTuple):
 
 
 class AmbiguousWeights(NamedTuple):
-    """The weights beta of the sites in V are not unique.
+    """Finding that V is not unique, because its weights beta are not.
+
+    V is the weighted sum of the energies of all arms. The weights are unique if every arm
+    follows every other arm, at least through further arms.
 
     Attributes:
         groups: Names of the sites in each closed group, which follows nobody outside.
@@ -133,7 +147,7 @@ class AmbiguousWeights(NamedTuple):
 
 
 class CoarseEnergies(NamedTuple):
-    """The energies are not known precisely enough to decide whether V rose.
+    """Finding that the energies are not known precisely enough to decide whether V rose.
 
     Attributes:
         tolerance_j: Size that a rise must exceed to count, in J.
@@ -145,7 +159,7 @@ class CoarseEnergies(NamedTuple):
 
 
 class FunctionalCourse(NamedTuple):
-    """The course of V over a run in which it can be judged.
+    """The energy function V over a run in which it can be judged: its values and largest rise.
 
     Attributes:
         failed: Names of the premises that fail. The theorem does not apply if there are any.
@@ -183,7 +197,7 @@ VerdictFacts = (
 
 
 class StabilityVerdict(NamedTuple):
-    """What the energy function V of the stability proof shows about a run.
+    """What V, the energy function of the stability proof, shows about a run, and the numbers.
 
     Attributes:
         finding: The finding, such as that V never rose.

@@ -1,5 +1,6 @@
-"""Computes the metrics of a recorded run, numbers that describe the run or a part of it.
+"""Computes numbers that describe a recorded run, such as the RMS error or the largest torque.
 
-They cover tracking, effort, energy, contact, force sharing, impedance, parameter error, network
-and control loop.
+These numbers are called metrics. They cover tracking, effort, energy, contact, force sharing,
+impedance, parameter error, network and control loop. To add a metric, decorate a function in a
+module of this folder with `measures.measures`.
 """

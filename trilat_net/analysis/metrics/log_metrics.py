@@ -1,14 +1,14 @@
 """Computes all metrics of a log, converts them to JSON, and compares several logs.
 
-A metric is the value of a quantity, such as the largest motor torque. It describes a subject:
-the whole run, a site (the process that runs one arm), a link between two sites, or a wall. The
-other modules of this folder define the quantities.
+A metric is a number that describes a run or a part of it, for example the largest motor torque
+of one arm. The other modules of this folder define the metrics. `LogMetrics` collects their
+values. `trilat metrics` prints them.
 
 Invariant:
-    - Each quantity is present for each subject to which it applies: as a number, or with the
-      reason why the number is missing.
+    - Each metric is present for each arm, link, wall or run to which it applies: as a number,
+      or with the reason why the number is missing.
     - In JSON a missing number is null, and the key `unknown` has the reason.
-    - A comparison has a column for each log and a row for each quantity of the whole run.
+    - A comparison has a column for each log and a row for each metric of the whole run.
 """
 
 import math

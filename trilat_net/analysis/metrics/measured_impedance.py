@@ -1,13 +1,14 @@
-"""Estimates what an operator feels in a recorded run: impedances and reflected forces.
+"""Estimates the impedance that an operator feels at an arm, from the records of a run.
 
-An impedance is the ratio of the operator's torque to the velocity of the arm, as a function of
-frequency. A reflection is the ratio of the torque that an operator feels to the torque with
-which the environment pushes another arm.
+The impedance is the ratio of the operator's torque to the velocity of the arm, as a function of
+frequency: a large impedance feels stiff or heavy. The module also estimates which share of the
+torque with which the environment pushes another arm reaches the operator (the reflected force).
 
-In a closed loop, each of the two signals x and y depends on the other. Therefore a third signal
-d, the drive, is needed, which depends on nothing else, such as the operator's planned torque.
-The ratio y / x at a frequency is S_dy / S_dx, where S is a cross-spectrum.
-docs/reference/metrics.md names the drives and the sources.
+In a closed loop, each of the two signals x and y of such a ratio depends on the other, and
+their plain ratio would be biased. Therefore a third signal d, the drive, is needed, which
+depends on nothing else, such as the operator's planned torque. The ratio y / x at a frequency
+is S_dy / S_dx, where S is a cross-spectrum. docs/reference/metrics.md names the drives and the
+literature.
 
 Invariant:
     - A ratio is given at the frequency with the strongest drive, and at all frequencies whose

@@ -1,9 +1,9 @@
-"""Registers the metrics of recorded runs, so that tables and commands find them by name.
+"""Lets a function register itself as a metric, so that tables and commands find it by name.
 
 A metric is a number that describes a run or a part of it, for example the RMS error of an arm.
-Each file of this folder contains functions that compute such numbers. The decorator `measures`
-registers a function together with the quantities that it returns. A subject is what a number
-describes: the run, a site (the process that runs one arm), a link or a wall.
+Each module of this folder contains functions that compute such numbers. The decorator
+`measures` registers a function together with the quantities that it returns (their names, units
+and meanings). A new metric therefore needs no change of the commands that print metrics.
 
 Invariant:
     - A value is a finite number, or None with a reason.
@@ -24,7 +24,7 @@ from ..run_view import RunView
 
 
 class Metric(NamedTuple):
-    """The value of a quantity for one subject: a number, or the reason why there is none.
+    """The value of a metric for one arm, link, wall or run: a number, or why there is none.
 
     Attributes:
         value: The number, which is finite. None if there is none.
@@ -65,9 +65,9 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns metrics without values for all quantities of a group, with a common reason.
+    """Returns metrics without values, with a common reason, for all quantities of one heading.
 
-    A function that measures a group returns them if, for example, a site has no records.
+    For example, a function that measures tracking returns them if an arm has no records.
 
     Args:
         group: Group of the quantities.
@@ -152,7 +152,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of some numbers, for metrics such as the peak torque.
+    """Returns the largest absolute value of some numbers, for example the peak torque.
 
     Args:
         values: The numbers, of any shape.
@@ -165,7 +165,9 @@ def peak(values: ArrayLike) -> float:
 
 
 class Quantity(NamedTuple):
-    """Definition of a number that a run, or each of its sites, links or walls has.
+    """Definition of a metric: its key, name and unit, and to what it applies.
+
+    For example, the RMS error has the unit rad and applies to each arm.
 
     Attributes:
         key: Key in programs. It ends in the unit, if there is any.

@@ -1,14 +1,14 @@
 """Computes metrics of motion, effort, contact forces, learning, links and control loops.
 
-A metric is a number that describes a recorded run or a part of it. A site is the process that
-runs one arm. The arm is a master, which a person moves, or a slave. The error of a site is the
-difference between the joint angles of its arm and the weighted mean of the angles of the arms
-that it follows, which arrive with a delay. docs/reference/metrics.md defines every metric.
+A metric is a number that describes a recorded run or a part of it, for example the RMS tracking
+error of the slave arm in rad. The tracking error is the difference between the joint angles of
+an arm and the weighted mean of the angles of the arms that it follows, which arrive with a
+delay. docs/reference/metrics.md defines every metric.
 
 Invariant:
-    - The error includes the delay of the links. The largest distance between the arms (spread)
-      is computed at the same instant. A slave is compared with its master at the time at which
-      the state that it uses was sent.
+    - The tracking error includes the network delay. The largest distance between the arms
+      (spread) is computed at the same instant. A slave is compared with its master at the time
+      at which the state that it uses was sent.
     - The effort is computed from the recorded motor torque, after the torque limit and with
       gravity compensation.
     - The force of a wall is computed from the scenario and the recorded motion. Ticks without a
@@ -419,7 +419,7 @@ class _BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of the arm parameters theta that a site made during a run, shape (P,) each.
+    """Estimates of the arm's dynamic parameters theta during a run, shape (P,) each.
 
     Attributes:
         learnt: True for each parameter that the law adapts.

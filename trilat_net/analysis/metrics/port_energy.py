@@ -1,20 +1,21 @@
 """Computes the energy that enters each arm, and the energy that network delays inject.
 
-Energy enters an arm through its ports: the controller, the operator and the environment. The
-work of a torque tau during a small motion dq of the joints is tau'dq. If the torque tau_k is
-constant during tick k, its work is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint
-angles. If the torque follows the motion, the trapezoid rule is used, which is exact for
-springs. The sum over the ticks is known as a passivity observer (Hannaford and Ryu 2002).
+Delays can make coupled arms unstable, because the control torques then supply energy that no
+operator supplied. These numbers show where it comes from. Energy enters an arm from the
+controller, the operator and the environment. The work of a torque tau during a small motion dq
+of the joints is tau'dq. If the torque tau_k is constant during tick k, its work is exactly
+tau_k' (q_{k+1} - q_k), where q_k are the joint angles. If the torque follows the motion, the
+trapezoid rule is used, which is exact for springs. The sum over the ticks is known as a
+passivity observer (Hannaford and Ryu 2002).
 
-A link carries the state of site j, the process that runs one arm, to site i with the delay
-T_ij. The control torque of site i is the torque without delay, plus a term for each link. The
-energy of this term is
+A link carries the state of arm j to arm i with the delay T_ij. The control torque of arm i is
+the torque without delay, plus a term for each link. The energy of this term is
 
     E_ij = int qd_i' S_i ( p_j(t - T_ij) - p_j(t) ) dt
 
-Here qd_i is the joint velocity of site i, p_j the signal that the law uses from site j, such as
+Here qd_i is the joint velocity of arm i, p_j the signal that the law uses from arm j, such as
 its position, and S_i the gain of the law for this signal. docs/reference/metrics.md lists p_j
-and S_i for each law, and the sources.
+and S_i for each law, and the literature.
 """
 
 import numpy as np

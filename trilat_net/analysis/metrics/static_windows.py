@@ -1,19 +1,17 @@
-"""Computes stiffness and force sharing from the times in which all arms rest.
+"""Computes the stiffness that a user feels, from the times of a run in which all arms rest.
 
-A site is the process that runs one arm. A static window is a time in which all arms rest under
-constant torques. The stiffness that a user feels follows from two windows: it is the ratio of
-the changes of torque and angle between them.
+A time in which all arms rest under constant torques is called a static window. The stiffness is
+the ratio of the changes of torque and angle between two static windows.
 
-Force sharing concerns an operator who holds an arm while a torque acts on another arm. The
-dominance factors are the weights with which the sites follow each other. At rest the torques
-tau_i on the arms satisfy
+The module also computes how the arms share a force: an operator holds one arm while a torque
+acts on another arm. At rest the torques tau_i on the arms satisfy
 
     sum_i (pi_i / K_i) tau_i = 0   for every joint
 
-Here pi is the left eigenvector of the matrix of dominance factors for the eigenvalue 1 (Perron
-vector). K_i is the stiffness, in N m/rad, with which the controller of site i pulls its arm to
-the position that it follows. The equation predicts the torque that the operator feels.
-docs/reference/metrics.md derives each metric.
+This equation predicts the torque that the operator feels. pi is the left eigenvector, for the
+eigenvalue 1 (Perron vector), of the matrix of the weights with which the arms follow each
+other. K_i is the stiffness, in N m/rad, with which the controller of arm i pulls its arm to the
+position that it follows. docs/reference/metrics.md derives each metric.
 
 Invariant:
     - A stiffness is reported only if nothing but a single operator changed between the two

@@ -1,8 +1,8 @@
 """Computes how several users share one slave arm: authority, disagreement and takeovers.
 
-The users are the operators who move the master arms of the scenario, and the shared slave is
-its first slave. The slave follows each user's master with a weight, the dominance factor of the
-user, which may change during the run.
+In trilateral teleoperation, for example, two users (a trainer and a trainee) move two master
+arms, and one slave arm follows both. It follows each master with a weight, the dominance factor
+of the user, which may change during the run. The slave is the first one of the scenario.
 
 Invariant:
     - The user with the largest dominance factor leads.

@@ -1,12 +1,13 @@
-"""Predicts stability, delay margins and haptic properties of the arms by linear analysis.
+"""Predicts by linear analysis whether coupled arms are stable, and what their operators feel.
 
-The control loop of all arms, with its delays and ticks, is linearised about a pose in which all
-arms rest. Its characteristic roots tell whether small motions die away. docs/studies/linear.md
-and docs/studies/ports.md have the definitions, equations and sources.
+The control loop of all arms, with its delays and sampling, is linearised about a pose in which
+all arms rest. Its characteristic roots tell whether small motions die away. For example, the
+delay margin is the largest network delay for which they do. docs/studies/linear.md and
+docs/studies/ports.md have the definitions, equations and literature.
 
 Invariant:
     - The equations are written a second time in plain NumPy and share nothing with the compiled
-      core, so that roots and simulated runs check each other.
+      simulation, so that roots and simulated runs check each other.
     - The simulation only supplies the pose at which a run comes to rest.
 """
 

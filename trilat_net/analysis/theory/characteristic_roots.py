@@ -240,10 +240,10 @@ states, each of which has a root at zero.
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
-    """Removes the states of a linear loop that are constant or act on no other state.
+    """Removes the states of a linear loop that do not change or act on no other state.
 
-    These states do not influence the other modes of the loop. Each of them only adds a
-    characteristic root at zero.
+    For example, a parameter estimate may act on no motion. These states do not influence the
+    other modes of the loop. Each of them only adds a characteristic root at zero.
 
     Args:
         pencil: Matrices and delays of the loop.
@@ -283,7 +283,7 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 
 
 class CharacteristicRoot(NamedTuple):
-    """A characteristic root s, which stands for the motion exp(s t) of a mode.
+    """A characteristic root s of a loop: small motions may be proportional to exp(s t).
 
     A complex root comes with its conjugate, which is not listed.
 
@@ -616,7 +616,9 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Computes the rightmost roots of a continuous loop, which decide its stability.
+    """Computes the rightmost characteristic roots of a loop with delays, in continuous time.
+
+    The loop is stable if all roots have a negative real part.
 
     Args:
         loop: The loop.

@@ -1,12 +1,11 @@
-"""Finds poses in which all coupled arms and their parameter estimates are at rest.
+"""Finds a pose in which all coupled arms and their parameter estimates are at rest.
 
-The linear stability analysis describes small motions about one of these equilibria. It may be
-the equilibrium at the end of a run, the equilibrium nearest to a given pose, or the equilibrium
-that the arms reach from their start poses according to their linear model.
-
-Any pose on which all arms agree may be an equilibrium: there are infinitely many. Therefore the
-equilibrium nearest to a known pose is computed. A simulated run may supply this pose, but the
-equilibrium itself is found by solving the equations.
+The linear stability analysis describes small motions about such a pose, an equilibrium. There
+are infinitely many, because any pose on which all arms agree may be an equilibrium. Therefore
+`find_equilibrium` computes the one nearest to a given pose, for example to the last pose of a
+run. `predict_equilibrium` computes the one that the arms reach from their start poses according
+to their linear model. A simulated run may supply a pose to start from, but the equilibrium
+itself is found by solving the equations.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.

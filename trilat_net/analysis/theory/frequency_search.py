@@ -1,9 +1,9 @@
 """Finds minima of curves over frequency, and the bands in which a curve is below a level.
 
-Curves such as eigenvalues of a frequency response can be evaluated only at discrete
-frequencies. A grid of frequencies is refined where the response changes by more than a tenth
-between two points, and around minima until the neighbours of each minimum lie less than 1 %
-above it.
+The curves, such as eigenvalues of a frequency response, can be evaluated only at discrete
+frequencies, and a coarse grid would miss narrow minima. Therefore the grid is refined where the
+response changes by more than a tenth between two points, and around minima until the neighbours
+of each minimum lie less than 1 % above it.
 
 Invariant:
     - Values on a grid are evidence but no proof: features that are narrower than the steps of

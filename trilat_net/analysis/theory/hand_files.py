@@ -1,4 +1,9 @@
-"""Reads the hands that `trilat identify hand --json` wrote, for the analysis of the ports."""
+"""Reads the measured mass, damping and stiffness of a person's hand from a file.
+
+`trilat identify hand --json` measures how a hand reacts to forces and writes the file. The
+analysis of ports (`port_passivity`) can then check whether coupled arms are stable with this
+hand, instead of with every passive operator.
+"""
 
 import json
 from collections.abc import Sequence

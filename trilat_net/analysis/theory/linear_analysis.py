@@ -1,21 +1,22 @@
 """Predicts whether small motions of coupled arms die away, for a scenario or a log.
 
-The control loop is linearised about an equilibrium, a pose in which all arms rest. Its
-characteristic roots decide: the loop is stable if all roots have a negative real part. They are
-computed for the sampled loop, whose controllers compute once per tick (period of the control
-loop), and for its continuous approximation. The analysis also contains the delay margin and, if
-requested, the settings at the edge of stability and what operators feel.
+`analyse_linear_loop` does the work of the command `trilat linear`. It linearises the control
+loop about an equilibrium, a pose in which all arms rest, and computes its characteristic roots:
+the loop is stable if all roots have a negative real part. The roots are computed for the
+sampled loop, whose controllers compute once per period (tick), and for its continuous
+approximation. The result also contains the delay margin and, if requested, the settings at the
+edge of stability and what operators feel.
 
-Without a given pose, the loop is the one whose roots a stability certificate states: that of
-`loop_roots`, at the rest nearest to the end of a run. If delays are random or measured, the
-sampled loop uses the delays that occurred in the last quarter of the run, and the continuous
-loop uses their means. For a log, the loop is that after all commands, and the recorded run is
-not executed again. For a scenario, its run is simulated. Only if this run diverges, or if there
-is no rest near its end, the equilibrium is predicted, or that of a longer run.
+Without a given pose, the analysis uses the loop of `loop_roots`, as a stability certificate
+does: the equilibrium nearest to the end of a run. For a log, the loop is that after all
+commands, and the recorded run is not executed again. For a scenario, its run is simulated. Only
+if this run diverges, or if there is no equilibrium near its end, the equilibrium is predicted,
+or that of a longer run is used. If delays are random or measured, the sampled loop uses the
+delays that occurred in the last quarter of the run, and the continuous loop uses their means.
 
 Invariant:
-    - The verdict is based on the sampled loop, at any tick rates and delays. If a control law
-      can be linearised in continuous time only, the verdict is based on the continuous loop.
+    - The verdict is based on the sampled loop. If a control law can be linearised in continuous
+      time only, the verdict is based on the continuous loop.
     - The verdict holds for small motions about the equilibrium only.
 """
 

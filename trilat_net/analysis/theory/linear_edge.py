@@ -1,10 +1,11 @@
 """Finds the values of a setting at which coupled arms become stable or unstable.
 
-A value at which this happens is called an edge. The setting is a number of the scenario (the
-description of an experiment), such as a gain or a delay, and is named by its key. The growth
-rate of small motions is the real part of the rightmost characteristic root of the linearised
-control loop. The loop is unstable if the growth rate is positive. It is evaluated for some
-values of the setting. Between two values with different signs, Brent's method finds its zero.
+For example, an edge of the damping gain of a slave is the gain at which its oscillations
+neither grow nor decay. The setting is a number of the scenario (the description of an
+experiment), named by its key. The growth rate of small motions is the real part of the
+rightmost characteristic root of the linearised control loop, and the loop is unstable if it is
+positive. It is evaluated for some values of the setting. Between two values with different
+signs, Brent's method finds its zero, the edge.
 
 The sampled loop, whose controllers compute once per tick (period of the control loop), is
 analysed if the tick matters. This is so for the integration scheme `digital` (zero-order hold,
@@ -369,6 +370,8 @@ class _GrowthRate:
 
 class GrowthColumn(NamedTuple):
     """Growth rate of small motions of coupled arms, for several values of one setting.
+
+    A positive rate means that the arms are unstable at this value.
 
     Attributes:
         growth_per_s: Growth rate for each value, in 1/s, which is the real part of the

@@ -1,13 +1,12 @@
 """Linearises the control loop of all arms about a pose of rest, with network delays.
 
-A site is a process that runs one arm. For small deviations x from the pose of rest, the result
-is a differential equation with delays:
+For small deviations x from the pose of rest, the result is a differential equation with delays:
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-The state x contains, for each site, its joint angles, its joint velocities, and the parameter
+The state x contains, for each arm, its joint angles, its joint velocities, and the parameter
 estimates of its control law. The inputs u are the torques that operators add on the joints, the
-outputs y are the joint velocities, T_k are the delays of the links, and A, A_k, B, B_k and C
+outputs y are the joint velocities, T_k are the delays of the network, and A, A_k, B, B_k and C
 are constant matrices.
 
 For an arm with n joints in a chain, the control law may estimate ten parameters theta_hat per
@@ -18,7 +17,7 @@ is z' = -Y_G Gamma Y' r, with the regressor Y of the control law, its adaptation
 its filtered error r = e' + Lambda e. Here e is the error of the joint angles and Lambda a gain.
 The remaining combinations are omitted. They only add roots at zero.
 
-In task space, where end effectors instead of joints follow each other, the sites are coupled
+In task space, where end effectors instead of joints follow each other, the arms are coupled
 through the poses and velocities of their end effectors.
 """
 
@@ -94,7 +93,9 @@ class DelayedTerm(NamedTuple):
 
 
 class LinearLoop(NamedTuple):
-    """A linear loop with delays, in the notation of the module's docstring.
+    """Linear model of the coupled arms near a pose of rest, with network delays.
+
+    The module's docstring has the equation and the notation.
 
     Attributes:
         names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".

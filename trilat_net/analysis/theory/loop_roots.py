@@ -1,24 +1,25 @@
-"""Decides which characteristic roots a control loop has at the end of a run, for every command.
+"""Computes the characteristic roots of the control loop at the end of a run, for every command.
 
-The coupled arms are linearised at the pose at which a run ended. If all roots have a negative
-real part, small motions about this pose die away. The roots belong to the final loop: the
-delays, dominance factors (weights with which the arms follow each other), operators and
-environments that are in force at the end, after all planned changes and all commands.
+If all roots have a negative real part, small motions about the last pose of the run die away.
+The control loop of the coupled arms may change during a run, by planned changes or commands.
+Therefore this module first finds the final loop: the delays, weights, operators and
+environments that are in force at the end. Then it linearises this loop at the last pose.
 
-The delays of the final loop are known if they are constant, or follow sinusoids or traces that
-repeat. If a trace has ended, its last delay is constant. Random and measured delays are known
-from the records only. The roots are then those of the samples that were used in the last
-quarter of the records.
+The delays of the final loop are known if they are constant, or follow sinusoids or tables that
+repeat. If a table has ended, its last delay is constant. Random and measured delays are known
+from the records only. The roots are then those for the delays that occurred in the last quarter
+of the records.
 
 Invariant:
     - Roots are called exact only if every delay is constant or repeats after the analysed
-      period, if the loop is analysed with its ticks, the periods of its controllers, and if
+      period, if the loop is analysed with its ticks (the periods of its controllers), and if
       their rightmost one has the same sign at the last pose and at the rest next to it.
     - A command that leaves a link or a dominance factor as it was changes nothing.
     - The code of imported control laws is executed only with permission. Without it, such a
-      loop has no roots. With it, unstable roots count as exact and stable ones do not: the law
-      may contain thresholds that its derivative at the pose does not show. The same holds for
-      sampled walls, which may hammer although the rest beside them is stable.
+      loop has no roots.
+    - With permission, unstable roots count as exact and stable ones do not: the law may contain
+      thresholds that its derivative at the pose does not show. The same holds for sampled
+      walls, which may oscillate although the rest beside them is stable.
 """
 
 import math

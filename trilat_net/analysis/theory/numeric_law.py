@@ -1,7 +1,8 @@
-"""Linearises a control law that a user wrote, by central differences.
+"""Linearises a control law of which only the code exists, by central differences.
 
-Only the code of the law exists, and not its equations. For one tick (period of the control
-loop), the code is treated as a function of numbers:
+A user may write a control law as a Python function. Its derivatives are needed for the linear
+analysis, but its equations are unknown. For one tick (period of the control loop), the code is
+treated as a function of numbers:
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque)
 

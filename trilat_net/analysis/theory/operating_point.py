@@ -1,14 +1,12 @@
 """Determines the delays, weights and operators with which the control loop is linearised.
 
-A scenario, the description of a run, may change during the run: the delays of the links, the
-dominance factors (the weights with which an arm follows its peers), and the operators. A linear
-loop has only one set of these numbers, its operating point. It consists of the numbers at the
-end of the run.
+Delays, weights and operators may change during a run, but a linear loop has only one set of
+these numbers, its operating point. It consists of the numbers at the end of the run.
 
-A link is the connection from one site (the process that runs one arm) to another. Its effective
-delay is the age of the peer's sample that the site uses in a tick. With a constant delay T and
-the same tick h at both sites, the effective delay is max(1, ceil(T / h)) ticks. Otherwise it is
-the mean over the same random draws that a run makes.
+The effective delay of a link is the age of the state that the receiver uses in a tick (period
+of its control loop). It may be longer than the network delay T, because a controller uses a
+state only at its next tick. With a constant delay and the same tick h at both ends, it is
+max(1, ceil(T / h)) ticks. Otherwise it is the mean over the same random draws that a run makes.
 
 Invariant:
     - A note reports every number that differed earlier in the run or that is random.
@@ -54,7 +52,7 @@ from .site_dynamics import SiteRates, evaluate_site_rates
 
 
 class Equilibrium(NamedTuple):
-    """The pose about which a loop is linearised, with all sites at rest.
+    """The pose about which the coupled arms are linearised, with all arms at rest.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints end in zeros.
@@ -97,7 +95,7 @@ class _EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The numbers from which the linear model of a loop is built.
+    """The gains, delays, weights and operators from which the linear model of a loop is built.
 
     They are those at the end of a run of the scenario, see `OperatingConditions.derive`. N is
     the number of sites.

@@ -1,7 +1,8 @@
 """Analyses what operators feel in coupled arms, and whether the arms stay stable.
 
-A haptic port is where an operator or an environment touches an arm. It has two variables: the
-torque that acts on a joint, and the velocity of the joint. Three properties are examined:
+A place where an operator or an environment touches an arm is called a port, as in electrical
+networks. A port has two variables: the torque that acts on a joint, and the velocity of the
+joint. `analyse_ports` examines three properties:
 
 - Passivity: the arms never return more energy at their ports than they received there.
 - Absolute stability: the arms are stable with any passive operators.
@@ -10,9 +11,8 @@ torque that acts on a joint, and the velocity of the joint. Three properties are
 If end effectors follow each other instead of joints, the ports are at the end effectors, along
 the followed axes. The joint angles q are then replaced by x = J q and z = N' q. J is the
 Jacobian of the followed axes at rest, and N a basis of the joint motions that leave these axes
-unchanged. The velocity of a port is the rate of change of x. A force F on the end effector acts
-as the joint torque J' F. Ports are numbered by their axis: 1 to 3 for the position, 4 to 6 for
-rotations. The position of port 2, for example, is called "q2", like the angle of a joint.
+unchanged. A force F on the end effector acts as the joint torque J' F. Ports are numbered by
+their axis: 1 to 3 for the position, 4 to 6 for rotations.
 
 Invariant:
     - Operators and environments are removed from the loop. Their torque at rest stays as a
@@ -179,7 +179,10 @@ class TwoPort(NamedTuple):
 
 
 class PortAnalysis(NamedTuple):
-    """Results of the analysis of a teleoperator's ports, see `analyse_ports`.
+    """What operators feel in coupled arms, and whether the arms are passive.
+
+    `analyse_ports` computes it. A port is the place where an operator or an environment touches
+    an arm, such as a joint.
 
     Attributes:
         scenario: The teleoperator.
@@ -228,7 +231,7 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The word for a port in texts: "joint", or "axis" for arms in task space."""
+        """Word for a port in tables and texts: "joint", or "axis" for arms in task space."""
         return "axis" if self.axes else "joint"
 
     @property

@@ -1,17 +1,17 @@
 """Checks whether coupled arms stay stable with every passive operator, at any frequency.
 
-A port is where an operator touches an arm. The admittance Y of the ports is the matrix that
-maps their torques u to their velocities at one frequency. The torques u supply the mean power
-1/4 u^H (Y + Y^H) u to the control loop, where ^H is the conjugate transpose.
+A passive operator is a person or object that cannot supply energy on balance. A place where an
+operator touches an arm is called a port. The admittance Y of the ports is the matrix that maps
+the torques u of the operators to the velocities of the ports at one frequency. The torques
+supply the mean power 1/4 u^H (Y + Y^H) u to the arms, where ^H is the conjugate transpose.
 
-There are two conditions for a stable loop:
+There are two conditions for a stable control loop:
 
 - The loop is passive if Y + Y^H has no negative eigenvalue at any frequency. It is then stable
   with every passive environment, also with operators who are coupled to each other.
 - The loop is absolutely stable, that is, stable with independent passive operators, under a
   weaker condition. At each frequency there is a diagonal matrix D of positive weights for which
-  D Y + Y^H D has no negative eigenvalue. D has one weight per site, the process that runs one
-  arm.
+  D Y + Y^H D has no negative eigenvalue. D has one weight per arm.
 
 Sources:
     - Passivity and passive environments: Colgate and Hogan, "Robust control of dynamically
@@ -20,17 +20,17 @@ Sources:
       properties of transmission systems", Proc. IRE 40 (1952). The parameter that must be at
       least 1 is from Adams and Hannaford, "Stable haptic interaction with virtual
       environments", IEEE Trans. Robotics and Automation 15 (1999).
-    - Absolute stability for several joints and sites, in special cases: Li, Tavakoli and Huang,
+    - Absolute stability for several joints and arms, in special cases: Li, Tavakoli and Huang,
       "Absolute stability of multi-DOF multilateral haptic systems", IEEE Trans. Control Systems
       Technology (2014).
     - The weights D, as in the structured singular value: Packard and Doyle, "The complex
       structured singular value", Automatica 29 (1993).
 
 Invariant:
-    - Passivity with positive weights per site proves stability for passive operators that are
+    - Passivity with positive weights per arm proves stability for passive operators that are
       not coupled to each other.
-    - The condition of absolute stability is sufficient for any number of sites, and also
-      necessary for up to three sites.
+    - The condition of absolute stability is sufficient for any number of arms, and also
+      necessary for up to three arms.
 """
 
 from collections.abc import Sequence
@@ -192,7 +192,7 @@ def check_against_hands(
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
-    """Scales the response at some ports, so that its passivity is judged with weights.
+    """Multiplies a frequency response by weights, so that its passivity is judged with them.
 
     The result is D^1/2 Y D^-1/2 with D = diag(weights). The eigenvalues of its Hermitian part
     have the same signs as those of D Y + Y^H D.
@@ -356,10 +356,10 @@ def llewellyn_rounding(Y: Complex) -> Array:
 
 
 def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
-    """Returns the admittance at some ports while the velocity of other ports is held at zero.
+    """Returns the admittance at some joints while other joints are clamped.
 
-    The admittance is the velocity per torque. The result is a Schur complement. At ports in
-    neither list no torque acts: they move freely.
+    The admittance is the velocity per torque, and a clamp holds the velocity at zero. The
+    result is a Schur complement. Joints in neither list move freely.
 
     Args:
         Y: Admittance at all ports, shape (F, p, p).

@@ -222,7 +222,7 @@ def to_imaginary_axis(w_rad_s: Array) -> Complex:
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the name of the site to which a port or a state of a linear loop belongs.
+    """Returns the arm's site to which an input or state of a linear model belongs.
 
     Args:
         port: Name of the port or state. For "m1.tau2" the site is "m1".
@@ -278,9 +278,10 @@ def _parse_port_joint(port: str) -> int:
 
 
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
-    """Groups the ports of a loop by the number of their joint, in the order of the sites.
+    """Groups the inputs of a linear model by their joint, in the order of the sites.
 
-    Ports of the same joint can be analysed together, apart from the other joints.
+    The first joints of all arms, for example, can then be analysed together, apart from the
+    others.
 
     Args:
         loop: The loop.
@@ -296,10 +297,10 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
 
 
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
-    """Returns the response at some ports, while no operator acts at the others.
+    """Restricts a frequency response to some joints, at which operators act.
 
-    A port at which no operator acts has the torque zero, so that its rows and columns are left
-    out.
+    No operator acts at the other joints, so that their torque is zero, and their rows and
+    columns are left out.
 
     Args:
         response: The response at all ports, as a function of frequency.
@@ -475,7 +476,7 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """Impedance that an operator feels along a joint, with another site free and clamped.
+    """Impedance that an operator feels at a joint, with another arm free and clamped.
 
     Attributes:
         operator_site: Site of the operator.

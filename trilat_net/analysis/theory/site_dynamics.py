@@ -1,12 +1,11 @@
-"""Computes the rates of change of one arm's and its controller's state, and their derivatives.
+"""Computes how fast the state of an arm and its controller changes, and the derivatives.
 
-A site is the process that runs one arm. Its state consists of the joint angles, the joint
-velocities, and the parameter estimates of its control law. The linear analysis needs the
-derivatives of the rates of change with respect to the state. They are computed with a complex
-step: the derivative of a function f at x is Im f(x + i h) / h, where i is the imaginary unit
-and h = 1e-30. Nothing is subtracted. Therefore the result is exact to rounding (Squire and
-Trapp, "Using complex variables to estimate derivatives of real functions", SIAM Review 40,
-1998).
+The linear analysis needs the derivatives of the rates of change with respect to the state: the
+joint angles, the joint velocities, and the parameter estimates of the control law. They are
+computed with a complex step: the derivative of a function f at x is Im f(x + i h) / h, where i
+is the imaginary unit and h = 1e-30. Nothing is subtracted. Therefore the result is exact to
+rounding (Squire and Trapp, "Using complex variables to estimate derivatives of real functions",
+SIAM Review 40, 1998).
 
 Invariant:
     - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel,

@@ -1,1 +1,6 @@
-"""Twins: repeated runs with a small push, and whether the push grows."""
+"""Measures whether small disturbances of a run grow or die away, by repeating the run.
+
+A repetition of a run that receives a small push, for example of one joint, is called a twin.
+The differences between the twin and the run show how the coupled arms react to a disturbance,
+even if the run itself was never disturbed.
+"""

@@ -1,23 +1,23 @@
 """Measures whether small disturbances of a run grow or die away, by repeating the run.
 
-A twin is a repetition of a run that receives a small push, for example of one joint. Without
-the push, it would be identical to the run. The effect of the push is measured by the
-differences d of the joint velocities between the twin and the run, 20 times per second. Their
-amplitude A is
+A repetition of the run that receives a small push, for example of one joint, is called a twin.
+Without the push, it would be identical to the run. 20 times per second, the differences d of
+the joint velocities between the twin and the run are computed. The size of the disturbance is
+their amplitude A, with
 
     A^2 = sum over joints of d^2 + (a / w)^2
 
 Here a is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts are
 equal on average. If d is an oscillation that grows or decays with a certain rate, A does not
-oscillate, but is proportional to exp(rate t) over the time t. The rate is the slope of log A
-over the part of the run that is judged. `envelope_trend` defines the bounds of the slope, and
-the classes such as "grows" and "decays".
+oscillate, but is proportional to exp(rate t) over the time t. The rate is therefore the slope
+of log A over the part of the run that is judged. `envelope_trend` defines the bounds of the
+slope, and the classes such as "grows" and "decays".
 
 Invariant:
     - Velocities are compared. If a push merely shifts all arms to another position of rest, the
       difference becomes zero.
-    - A scenario may contain several groups of arms that do not follow each other. Each group is
-      judged separately, so that growth in one group is not hidden by another group.
+    - In a scenario whose arms form groups that do not follow each other, each group is judged
+      separately, so that growth in one group is not hidden by another group.
 """
 
 import math
@@ -78,9 +78,9 @@ MOST_LOG = 700.0
 class PushGrowth(NamedTuple):
     """How the effect of one push developed over the judged part of a run.
 
-    A push is a small disturbance in a repetition of the run, called a twin. Its effect is the
-    difference between the twin and the run. If a run has several groups of sites that do not
-    follow each other, a push has one such object for each group.
+    A push is a small disturbance in a repetition of the run, which is called a twin. Its effect
+    is the difference between the twin and the run. If some arms of the scenario do not follow
+    the others, a push has one such object for each group of arms that follow each other.
 
     Attributes:
         push: The push: what was changed, when and by how much.
@@ -147,10 +147,10 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """Whether small pushes of a run grow or die away, computed by `judge_twins`.
+    """Whether small pushes grow or die away in repetitions of a run, computed by `judge_twins`.
 
-    Each push is made in a repeated run, called a twin. Its difference from the run is then
-    observed.
+    Each push is made in a repetition of its own, which is called a twin. The difference between
+    the twin and the run is then observed.
 
     Attributes:
         why: The reason why there are no twins. Empty if there are.
@@ -787,7 +787,9 @@ class _LinearSizes(NamedTuple):
 class PushedTwins(Result):
     """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
 
-    A push is a small disturbance in a repetition of the run, called a twin.
+    For example, a push changes the angle of one joint by a small amount, in a repetition of the
+    run that is called a twin. The result says whether the difference from the run grows or dies
+    away.
 
     Attributes:
         log: The log of the run.

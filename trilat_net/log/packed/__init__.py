@@ -1,7 +1,9 @@
-"""Reads encoded messages in compiled code, without a Python object for each of them.
+"""Decodes many messages of a log at once, in compiled code.
 
-The messages of a channel are stored one after another in one block of bytes. The compiled code
+At 1 kHz, one minute of a run yields 60 000 messages per arm, and a Python object for each of
+them would make reading slow. This package therefore keeps the messages of a channel one after
+another in one block of bytes, and reads numbers from the block with Numba. The compiled code
 accepts only the exact layout that this program writes. Everything else is left to the decoders
-of `record_columns` and `net.wire`, so that their results and error messages do not depend on
-this package.
+of `record_columns` and `net.wire`, so that results and error messages do not depend on this
+package.
 """

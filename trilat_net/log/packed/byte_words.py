@@ -1,9 +1,12 @@
-"""Loads numbers from arrays of bytes in compiled code.
+"""Loads eight bytes from an array as one integer, in compiled code.
+
+Compiled code thus compares and copies encoded messages eight bytes at a time, instead of byte
+by byte.
 
 Invariant:
-    - The caller makes sure that the eight bytes of a word lie within the array.
-    - All words are signed 64-bit integers, because Numba converts a sum of signed and unsigned
-      numbers to a floating-point number.
+    - The caller makes sure that the eight bytes lie within the array.
+    - All integers are signed, because Numba converts a sum of signed and unsigned numbers to a
+      floating-point number.
 """
 
 import sys

@@ -1,7 +1,11 @@
-"""Finds the messages in an unpacked chunk of an MCAP file, and copies their payloads.
+"""Finds all messages in an unpacked chunk of an MCAP file, in one pass of compiled code.
+
+A chunk is a block of a log that is compressed as a whole, and contains hundreds of messages of
+all channels. `walk_messages` finds where each message lies, and `copy_payloads` collects the
+messages of each channel.
 
 Invariant:
-    - The walk stops before everything but a complete message of a known channel, or a record
+    - The pass stops before everything but a complete message of a known channel, or a record
       that a reader ignores. The caller reads the rest as it reads any other file.
 """
 
@@ -35,10 +39,10 @@ AT_UNKNOWN = 2
 
 
 class MessageRun(NamedTuple):
-    """Messages that a walk through a chunk found, and sums over the messages of each channel.
+    """The messages that one pass over a chunk found, and counts for each channel.
 
-    A channel has a slot, a small number. The arrays have one entry per message, or one entry
-    per slot.
+    A slot is a small number that stands for a channel. The arrays have one entry per message,
+    or one entry per slot.
 
     Attributes:
         slots: Slot of each message's channel.
@@ -79,7 +83,10 @@ def allocate_run(slots: int, messages: int = 1) -> MessageRun:
 def walk_messages(
     data: Bytes, offset: int, slot_of_channel: NDArray[np.int32], long_bytes: int, run: Any
 ) -> tuple[int, int, int]:
-    """Finds messages in an unpacked chunk, from a place on.
+    """Finds the messages in an unpacked chunk, beginning at an offset.
+
+    It runs as compiled code, and stops at the first record that is neither a message of a known
+    channel nor a record to ignore, and after `CAPACITY` messages.
 
     Args:
         data: The unpacked chunk.
@@ -137,7 +144,7 @@ def copy_payloads(
     ends: Ints,
     times: Ints,
 ) -> None:
-    """Copies the payloads of one channel from a chunk.
+    """Collects the payloads of one channel from a chunk, one after another.
 
     Args:
         data: The unpacked chunk.

@@ -1,4 +1,8 @@
-"""Gives access to the fields of many records of a site as arrays, by compiled code.
+"""Gives the fields of many records of an arm as arrays, without decoding them one by one.
+
+A record is the message with the state of an arm in one period of its control loop. Compiled
+code finds the place of each field in the encoded records once. Then, for example, the ticks of
+all records are read directly from the bytes.
 
 Invariant:
     - All records have the exact layout that this program writes. Otherwise there is no
@@ -38,9 +42,9 @@ _TICK, _BOOT, _MODE = range(3)
 
 
 class IndexedRecords:
-    """Records of a site that have the exact layout, with the places of their values.
+    """Fields of K records of an arm, which compiled code reads directly from the encoded bytes.
 
-    `index_records` creates this object. K is the number of records.
+    All records have the layout that this program writes. `index_records` creates this object.
 
     Args:
         messages: The encoded records.

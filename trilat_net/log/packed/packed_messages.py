@@ -1,4 +1,8 @@
-"""Stores the encoded messages of a channel one after another in one block of bytes."""
+"""Stores the encoded messages of a channel one after another in one block of bytes.
+
+Compiled code can read the block without creating a Python object for each message. For all
+other code it behaves like a list of `bytes`.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, overload
@@ -16,7 +20,10 @@ message, and after the head of a number at its end.
 
 
 class PackedMessages(Sequence[bytes]):
-    """Read-only sequence of encoded messages, which are created as `bytes` when accessed.
+    """List of encoded messages that are stored in one block of bytes, and cannot be changed.
+
+    A message becomes a `bytes` object only when it is accessed, because thousands of objects
+    would take much memory and time.
 
     Args:
         data: The messages, followed by `PADDING` bytes.

@@ -1,8 +1,9 @@
 """Describes the exact bytes of a record as this program writes it, for compiled code.
 
-A record is the encoded result of one tick of a site, see `net.wire.encode_state`. Its fields
-have a fixed order. Between two values there are always the same bytes, such as the name of the
-next field. These bytes are called a literal.
+A record is the encoded state of an arm in one period of its control loop
+(`net.wire.encode_state`). Its fields have a fixed order, and the bytes between two values are
+always the same, such as the name of the next field. These constant bytes are called literals.
+By comparing them, `record_scan` recognises a record without a general decoder.
 """
 
 from collections.abc import Sequence
@@ -30,10 +31,10 @@ BEFORE_BUSY, BEFORE_SENT, BEFORE_ECHO, FIRST_VECTOR = range(10, 14)
 
 
 class RecordLayout(NamedTuple):
-    """The literals of a record, and the lengths of its vectors, for compiled code.
+    """The constant bytes (literals) between the values of a record, and its vector lengths.
 
-    Each literal is stored as words of eight bytes. Only the bytes that the mask of a word
-    selects are part of the literal.
+    Compiled code compares a record with them. Each literal is stored as words of eight bytes.
+    Only the bytes that the mask of a word selects are part of the literal.
 
     Attributes:
         bits: Words of all literals, shape (W,).
@@ -73,7 +74,7 @@ def _map_head(length: int) -> bytes:
 
 
 def make_record_layout(site: str, peers: Sequence[str], layout: Layout) -> RecordLayout:
-    """Returns the exact layout of the records of a site.
+    """Describes the exact bytes of the records of one arm, as this program writes them.
 
     Args:
         site: Name of the site.

@@ -1,4 +1,8 @@
-"""Checks encoded records against the exact layout, and finds the places of their values.
+"""Checks whether encoded records have the exact layout, and finds where their values lie.
+
+A record is the encoded state of an arm in one period of its control loop. Once the places of
+the values are known, a field of all records can be read directly from the bytes
+(`indexed_records`).
 
 Invariant:
     - A record is accepted only if the decoder of whole records accepts it too, with the same
@@ -346,7 +350,7 @@ def _scan_record(
 def scan_records(
     data: Bytes, starts: Ints, ends: Ints, layout: Any, heads: Ints, marks: Any, counts: Any
 ) -> int:
-    """Checks records, and finds the places of their values.
+    """Checks that each record has the exact layout, and finds where its values lie.
 
     Args:
         data: The records, followed by padding.
@@ -393,7 +397,9 @@ def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints
 
 @loop_leaf
 def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Ints) -> None:
-    """Reads floating-point numbers at fixed places after a mark, as their bits.
+    """Reads floating-point numbers, as their bits, from every record.
+
+    The numbers lie at fixed distances after a position in each record, the mark.
 
     Args:
         data: The records, followed by padding.
@@ -410,7 +416,7 @@ def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Int
 
 @loop_leaf
 def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
-    """Reads the arrivals of all records.
+    """Reads which samples of other arms arrived, and when, from every record.
 
     Args:
         data: The records, followed by padding.

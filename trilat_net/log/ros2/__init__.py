@@ -1,4 +1,9 @@
-"""Standard ROS 2 messages of a session: encoding, content, and channels for viewers."""
+"""Converts the messages of a session to standard ROS 2 messages, for viewers and ROS programs.
+
+ROS 2 is the Robot Operating System. The standard messages are encoded without a ROS
+installation. They are stored beside the session's own messages in a log, exported as a ROS 2
+bag, or published while a session runs.
+"""
 
 from typing import TYPE_CHECKING
 

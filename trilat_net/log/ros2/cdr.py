@@ -1,13 +1,14 @@
 """Encodes and decodes standard ROS 2 messages without a ROS installation.
 
-A message is encoded as little-endian CDR, the Common Data Representation of the OMG. It begins
-with a header of four bytes. Each field is aligned to its size, counted from the end of the
-header, and the padding before it is zero. A string or list begins with its length, a number of
-32 bits.
+A log can thus contain messages that viewers understand, and arms can be connected to ROS
+programs. A message is encoded as little-endian CDR, the Common Data Representation of the OMG.
+It begins with a header of four bytes. Each field is aligned to its size, counted from the end
+of the header, and the padding before it is zero. A string or list begins with its length, a
+number of 32 bits.
 
 Invariant:
     - The bytes of a message are the same as those of any other serializer.
-    - The layout of a message that sites publish at a high rate is computed once, so that it is
+    - The layout of a message that is published at a high rate is computed once, so that it is
       encoded by one call of `struct`.
 """
 

@@ -1,9 +1,9 @@
-"""Defines the topics of a session in ROS 2, and encodes their messages.
+"""Defines the topics under which ROS 2 programs see a session, and encodes their messages.
 
 ROS 2 is the Robot Operating System. The command `trilat ros2` publishes a running session as
 ROS 2 topics (the live bridge), and the export `ros2` converts a log to a bag, a recording of
-ROS 2. Both use this module. A bag contains a message for every record, the result of one period
-of an arm's control loop. The live bridge publishes a part of these messages.
+ROS 2. Both use this module. A bag contains a message for every record, the state of an arm in
+one period of its control loop. The live bridge publishes a part of these messages.
 
 Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,

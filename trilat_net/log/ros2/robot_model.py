@@ -1,9 +1,9 @@
-"""Builds the model of a site's arm for viewers: its URDF, and the poses of its links.
+"""Builds the model with which a viewer draws an arm: its URDF, and the poses of its links.
 
-A site is a process that runs one arm, and URDF is an XML description of a robot by its links
-(bodies) and joints. A viewer draws the arms of all sites in one scene. The arms stand in a row,
-`SPACING_M` apart, in a common frame `WORLD` whose z axis points up. If a URDF contains no
-shapes, plain ones are added, so that the arm can be seen. The files of meshes are never opened.
+URDF is an XML description of a robot by its links (bodies) and joints. A viewer draws the arms
+of all sites (processes that run one arm) in one scene. They stand in a row, `SPACING_M` apart,
+in a common frame `WORLD` whose z axis points up. If a URDF contains no shapes, plain ones are
+added, so that the arm can be seen. The files of meshes are never opened.
 
 Invariant:
     - The frame of a link is named "<site>/<link>", both in the URDF and in the transforms, so

@@ -1,10 +1,9 @@
-"""Makes the configuration with which RViz shows the arms of a session.
+"""Makes the configuration with which RViz, the 3D viewer of ROS 2, shows the arms of a session.
 
-RViz is the 3D viewer of ROS 2, the Robot Operating System. Its configuration is a YAML file
-that states which displays are shown, and of which topics. The configuration of a session has a
-display for the model of each arm and for each pose, besides the frames of all links and a grid.
-It serves a running session that the live bridge publishes, and an exported bag of this session,
-because both have the same topics.
+The configuration is a YAML file that states which displays are shown, and of which topics. It
+has a display for the model of each arm and for each pose, besides the frames of all links and a
+grid. The same file serves a running session that the live bridge publishes, and an exported bag
+of this session, because both have the same topics.
 
 Invariant:
     - Each topic of the configuration is a topic of the session, and has its quality of service:

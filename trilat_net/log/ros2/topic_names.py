@@ -1,12 +1,12 @@
 """Defines the names of a session's topics in ROS 2, for the live bridge and for bags.
 
-The live bridge publishes a running session (several sites, each of which controls one arm) as
-topics of ROS 2, the Robot Operating System. A bag is a recording of such topics, into which a
-log can be converted. The user chooses one of two conventions for the names, or changes names
-with a TOML file.
+The live bridge publishes a running session as topics of ROS 2, the Robot Operating System. A
+bag is a recording of such topics, into which a log can be converted. The user chooses one of
+two conventions for the names, or changes names with a TOML file.
 
 Invariant:
-    - A name that begins with / is a full name. Other names are below `/<session>/<site>`.
+    - A name that begins with / is a full name. Other names are below `/<session>/<site>`, where
+      the site is the process that controls one arm.
     - No two topics have the same name.
     - A topic has the same name in a bag as in the live bridge.
 """

@@ -1,11 +1,11 @@
-"""Writes the curves of a session for general viewers, with fewer points than the log.
+"""Writes the curves of a run for general viewers, with fewer points than the log.
 
-A site publishes about 1000 records a second, more than a viewer such as Foxglove can draw
-smoothly. Therefore the records of a site are collected in buckets, intervals of equal length. A
+Each arm publishes its state typically 1000 times a second, more than a viewer such as Foxglove
+can draw smoothly. Therefore the states are collected in buckets, intervals of equal length. A
 bucket becomes two messages of ROS 2, which contain the minimum and the maximum of each curve in
 the bucket, in the order in which the two occurred. Thus no peak is lost.
 
-The joints and their error appear in `views_hz` messages a second. The exogenous torque, the
+The joints and their error appear in `views_hz` messages a second. The external torque, the
 estimated parameters and the mode appear in only `SLOW_VIZ_HZ` messages a second.
 
 Invariant:

@@ -1,8 +1,8 @@
-"""Defines the formats to which logs are exported, one module per format.
+"""Defines the file formats to which logs can be exported, one module per format.
 
-A log is the MCAP file with the results of a run. The name of a module is the name of its
-format. A module has a constant `FORMAT` of the type `export.ExportFormat`. Adding a module to
-this folder adds a format to `trilat export`.
+The name of a module is the name of its format, as in `trilat log export run.mcap --to csv`. A
+module has a constant `FORMAT` of the type `export.ExportFormat`. To add a format, add a module
+to this folder.
 """
 
 import pkgutil

@@ -1,10 +1,9 @@
-"""Exports a log as a MATLAB file (.mat) with a struct per site and an array per column.
+"""Exports a log as a MATLAB file (.mat) with a struct per arm and an array per column.
 
-A site is a process that controls one arm, and a record is the stored result of one period of
-its control loop. In MATLAB, `m1.q1_rad` is a column of the records of the site m1, and
-`m1.link.age_s_us` is a column of its statistics of links. The struct `events` has the events of
-the session. The text `about_json` describes all columns, and the text `scenario_toml` is the
-scenario.
+For example, `m1.q1_rad` has the angle of the first joint of the arm m1 in each period of its
+control loop, and `m1.link.age_s_us` is a column of the statistics of its network connections.
+The struct `events` has the events of the session. The text `about_json` describes all columns,
+and the text `scenario_toml` is the scenario, the description of the experiment.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Draws the figures of a log, the file with the results of a run.
+"""Draws the figures of a run from its log, for papers and for the report.
 
 Each figure is drawn by one function, which is registered under the name of the figure
 (`figure_entry`). `registry` finds the function of a name and writes the figure to a file.

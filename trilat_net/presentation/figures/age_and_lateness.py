@@ -1,10 +1,12 @@
-"""Draws figures of communication and timing: ages and delays of samples, and timing of loops.
+"""Draws figures of network delays, and of the timing of control loops.
 
-A site is a process that controls one arm, and a tick is one period of its control loop. A
-sample is the state of the arm that the site publishes in a tick. A link is the directed
-connection between two sites. The delay of a sample is the time that it needs on its link. The
-age is the time since the sample that a receiver uses in a tick was sent: it grows until a newer
-sample arrives. The lateness is the time by which a tick started after it was due.
+An arm publishes its state, a sample, in each period of its control loop (tick). These figures
+answer whether the network and the computers were fast enough. They show three times:
+
+- The delay of a sample is the time that it needs on its way.
+- The age of a sample is the time since it was sent. At a receiver it grows until a newer sample
+  arrives.
+- The lateness is the time by which a tick started after it was due.
 
 Invariant:
     - If the delays of a link follow a measured series, the figure has no line for the delay

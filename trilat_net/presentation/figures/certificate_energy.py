@@ -1,14 +1,12 @@
 """Draws the energies that show whether a run was stable, in J over time.
 
-V is the energy function with which the stability of the coupled arms is proved. It contains the
-energy of motion, of position errors, of errors of the parameter estimates, and of delayed
-signals (docs/theory/certificate-energy.md). A site is a process that runs one arm. There are
-two
-figures:
+There are two figures:
 
-- `draw_functional` draws V, its parts, and the contribution of each site. It also draws the
-  energy that was dissipated, the work that was done on the arms, and the residual: the change
-  of V that dissipation and work do not explain.
+- `draw_functional` draws V, the energy function with which the stability of the coupled arms is
+  proved, and which must not rise by itself (docs/theory/certificate-energy.md). It also draws
+  the parts of V, the contribution of each arm, the energy that was dissipated, the work that
+  was done on the arms, and the residual: the change of V that dissipation and work do not
+  explain.
 - `draw_observed_energy` is for control laws that prove their passivity by bookkeeping: they
   record how much energy they have received and supplied. The figure draws these energies.
 

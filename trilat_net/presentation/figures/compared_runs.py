@@ -1,11 +1,11 @@
-"""Draws a signal of several runs over one another, with a panel per site and joint.
+"""Draws a signal of several runs over one another, with a panel per arm and joint.
 
-A site is a process that runs one arm. The colour of a line is that of its site, and the dashes
-tell the runs apart: the first run is solid. The legend names the settings in which the runs
-differ.
+For example, one can compare the angle of a joint for three delays. The colour of a line is that
+of its arm, and the dashes distinguish the runs: the first run is solid. The legend names the
+settings in which the runs differ.
 
 Invariant:
-    - A panel has one line for each run that has the site and the joint.
+    - A panel has one line for each run that has the arm and the joint.
 """
 
 import textwrap

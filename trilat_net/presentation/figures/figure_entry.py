@@ -1,7 +1,6 @@
-"""Registers the functions that draw figures of a log, each under a name.
+"""Lets a function register itself as a figure of a log, under a name.
 
-A log is the MCAP file with the results of a run. A module of this folder adds a figure by
-decorating a function:
+A module of this folder adds a figure by decorating a function:
 
     @draws("positions", "actual and desired angles", in_report=True)
     def draw_positions(log, form): ...
@@ -31,7 +30,7 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A figure that can be drawn from a log, as registered by the decorator `draws`.
+    """A figure that can be drawn from a log, with a description and a drawing function.
 
     Attributes:
         about: Description of the contents, for lists of figures.

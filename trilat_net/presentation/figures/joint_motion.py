@@ -1,8 +1,7 @@
 """Draws the signals of the arms, such as torques, angles, errors and contact forces.
 
-A site is a process that runs one arm, and an operator is the person or program that moves an
-arm. Each function with the decorator `draws` is one figure. Most signals are read from the
-records of the run. Some are computed:
+Each function with the decorator `draws` is one figure. Most signals are read from the log of
+the run. Some are computed:
 
 - Weights with which an arm follows the other arms (dominance factors) are computed from the
   scenario, the description of the experiment, and its recorded changes.
@@ -11,8 +10,8 @@ records of the run. Some are computed:
 - The settling time, after which an error stays small, is computed by `analysis.site_signals`.
 
 Invariant:
-    - Torques of operators are drawn as they act on the arm. The records contain the opposite
-      sign, the torque that the arm exerts on the operator.
+    - Torques of operators (the people or programs that move arms) are drawn as they act on the
+      arm. The log contains the opposite sign, the torque that the arm exerts on the operator.
 """
 
 from collections.abc import Sequence

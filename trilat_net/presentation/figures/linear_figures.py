@@ -1,11 +1,9 @@
-"""Draws figures of computed results, which need no recorded run.
+"""Draws the results of linear analyses and of network measurements, which need no recorded run.
 
-A linear model describes small motions of the coupled arms around a pose of rest. A site is a
-process that runs one arm, and an operator is the person or program that moves it. An operator
-and an arm exchange force and velocity at a port, such as a joint.
+A linear model describes small motions of the coupled arms around a pose of rest.
 
-- `draw_port_impedance` draws the impedance that operators feel at their ports, and
-  `draw_port_passivity` whether the arms could supply energy to operators.
+- `draw_port_impedance` draws the impedance that operators feel at the joints that they move,
+  and `draw_port_passivity` whether the arms could supply energy to operators.
 - `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
   executed in ticks (periods of the control loop). A root with a positive real part means that
   the arms are unstable.
@@ -13,7 +11,7 @@ and an arm exchange force and velocity at a port, such as a joint.
 - `draw_arm_gains` draws the largest stable stiffness of an arm for different delays.
 
 Invariant:
-    - Each line of a port has the colour of the site whose arm the operator holds. It is solid
+    - Each line of an impedance has the colour of the arm that the operator holds. It is solid
       if the other arm can move freely, and dashed if the other arm is clamped.
     - Frequencies at which a criterion of passivity or stability fails are shaded.
 """

@@ -2,9 +2,8 @@
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-A log is the MCAP file with the results of a run. The modules of this folder register their
-figures with the decorator `figure_entry.draws`. This module imports all of them, so that
-`FIGURES` is complete.
+The modules of this folder register their figures with the decorator `figure_entry.draws`. This
+module imports all of them, so that `FIGURES` is complete.
 
 Invariant:
     - A figure depends only on a log and a figure size.

@@ -1,13 +1,12 @@
 """Draws an overview of one run, or compares several runs, in four panels over time.
 
 The panels show the largest tracking error, the largest joint speed, the largest torque and the
-age of the oldest sample in use. A site is a process that controls one arm. A sample is the
-state of another arm that a site received over the network, and its age is the time since it was
-sent.
+age of the oldest state in use. An arm receives the states of other arms over the network, and
+the age of a state is the time since it was sent.
 
 Invariant:
-    - In the figure of one run, each line is a site.
-    - In the figure of several runs, each line is a run. It shows the largest value of all sites
+    - In the figure of one run, each line is an arm.
+    - In the figure of several runs, each line is a run. It shows the largest value of all arms
       of the run at any time.
 """
 

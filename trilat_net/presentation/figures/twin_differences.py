@@ -1,10 +1,10 @@
-"""Draws the differences between a run and its twins over time.
+"""Draws how a small disturbance of a run grows or decays over time.
 
-A twin is a second execution of the same run that received a small push at some time. Twins show
-whether small disturbances grow or decay. The upper panel has the differences of the joint
-velocities on a logarithmic axis, on which exponential growth is a straight line. A dashed line
-beside them has the growth rate that the headline states, as its slope. The lower panel has the
-joint speeds of the run itself.
+The run was repeated with a small push at some time. Such a repetition is called a twin. The
+upper panel has the differences of the joint velocities between twin and run on a logarithmic
+axis, on which exponential growth is a straight line. A dashed line beside them has the growth
+rate that the headline states, as its slope. The lower panel has the joint speeds of the run
+itself.
 
 Invariant:
     - The differences are drawn as they were measured.
