@@ -1,14 +1,18 @@
-"""Several Gymnasium environments for training a policy, which advance side by side in lanes.
+"""Advances several Gymnasium environments together, in SIMD vector lanes of one core.
+
+Training a policy needs millions of steps. Processors compute the same operation on several
+numbers at once. Therefore environments that differ in numbers only are simulated side by side:
+each has its lane, a position in the vector registers. NumPy computes the observations and
+rewards of all environments together.
 
 Each sub-environment is a `TeleoperationEnv`, which begins its episodes and can draw and save
-them. The steps of all sub-environments are computed together: their simulated runs are in the
-lanes of vector registers, and observations, rewards and information are computed by NumPy.
+them.
 
 Invariant:
     - Observations, rewards and information are those of the sub-environments one by one, as
       `gymnasium.vector.SyncVectorEnv` returns them, bit for bit.
-    - Sub-environments whose present episode cannot be computed in lanes are stepped one by one,
-      and the reason is in `obstacle`.
+    - A sub-environment whose present episode cannot share the vector instructions is stepped by
+      itself. If no sub-environment can, the attribute `obstacle` has the reason.
     - If an action is refused, no sub-environment makes a step.
 """
 
