@@ -1,19 +1,16 @@
-"""Measures a run and compares the result with the expectations of its scenario.
+"""Measures a run, such as its largest error, and compares the results with the expected limits.
 
-The table [expect] of a scenario states what a run must achieve. This module computes the
-metrics that the table can limit, such as the largest error or the time until the sites agree,
-and compares them with the limits. The run is either simulated in virtual time or read from a
-log. A site is a process that runs one arm and its control loop; a record is the result of one
-tick of this loop.
+A scenario, the file that describes an experiment, may contain a table [expect] of what a run
+must achieve. For example, `peak_error_max_rad` limits the largest error. This module computes
+the metrics that the table can limit, from a simulation or from the log of a run.
 
 Invariant:
     - Each metric has one definition. Both a simulation and a log pass their records, batch by
       batch in the order of time, to the same running statistics (`SiteStats`).
     - A metric that a run cannot give is None, and never a guess.
-    - Memory is bounded. Only extrema, sums, the last second of the records, and the buckets
-      for the judgement of the end are kept.
+    - Memory is bounded, however long the run is. Only extrema, sums, the last second of the
+      records, and a summary of the motion are kept.
     - The division of a run into batches changes only the last bits of a mean.
-    - The outcome of an expectation states the value, the limit and the margin.
 """
 
 import math

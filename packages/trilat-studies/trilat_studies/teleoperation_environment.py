@@ -1,20 +1,19 @@
 """A Gymnasium environment for training a policy that operates one arm over the network.
 
-A policy takes the place of one user of an experiment. In each step it observes what that user
-can observe of the local arm and of the peers, the other arms, whose states arrive with the
-delay of the network. Its action is a target for the arm, or a force on it. All sites, each of
-which runs one arm, are simulated in virtual time.
+The policy takes the place of one user of an experiment. In each step it observes what that user
+can observe: the state of the own arm, and the states of the other arms, which arrive with the
+delay of the network. Its action is a target for the arm, or a force on it. All arms are
+simulated, as fast as possible.
 
 Invariant:
-    - An episode is a run in virtual time, and a function of the scenario, the seed and the
-      actions. If the episode is saved as a log, this log can be verified bit for bit.
+    - An episode is a function of the scenario, the seed and the actions. If the episode is
+      saved as a log, this log can be verified bit for bit.
     - A step is a fixed number of ticks of the control loop. An action that is refused makes no
       step and changes nothing.
-    - Steps are possible only after a reset and until the end of the episode.
     - The observations, and the time at which an action takes effect, are the same as for a
       user-written operator (`OwnHand`). Therefore a trained policy can operate an arm in a live
-      session without changes. Only orientations differ: they are observed as six numbers,
-      which never jump (`expand_poses`).
+      session without changes. Only orientations differ: they are observed as six numbers, which
+      never jump (`expand_poses`).
 """
 
 import math

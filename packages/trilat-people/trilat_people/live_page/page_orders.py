@@ -1,26 +1,21 @@
-"""Defines the requests of the web pages of a session, and passes them to the robot arms.
+"""Defines the requests that a web page may send, and passes them to the robot arms.
 
-A session is a run in which several processes, called sites, each control one robot arm. People
-watch and control it on web pages. The role of a person is experimenter, user of one arm, or
-watcher.
-
-The server of the pages reads each message of a page with `read_page_message`, and checks with
-`Role.may` that the role permits it. `PageHands` then moves the arms that the person holds.
-`OrderDesk` sends other requests to the sites and receives their replies. A site may refuse a
-request.
+People watch and control a running session on web pages. The role of a person is experimenter,
+user of one arm, or watcher. The server of the pages reads each message of a page with
+`read_page_message`, and checks with `Role.may` that the role permits it. `PageHands` then moves
+the arms that the person holds. `OrderDesk` sends other requests to the sites, the processes
+that each control one arm, and receives their replies.
 
 Invariant:
     - A valid message has one of the types below, finite numbers in range, and names that the
-      session contains. A type of message may not arrive more often than its rate allows. Any
-      other message is counted and dropped.
+      session contains. Any other message, and any that exceeds the rate of its type, is counted
+      and dropped.
     - Of several requests that wait and change the same network link, only the newest is sent.
       The same holds for the weights with which a site follows the other arms.
     - Only one request at a time waits for the reply of a site. A request to stop the arm does
-      not wait for this, but is sent at once.
+      not wait for this, but is sent at once. Every role may send it.
     - The address of a page contains a secret token, which grants a role and, to a user, a site.
-      The rest of the address may lower the role, but never raise it. A token is needed on this
-      machine too, because other users of the machine can connect.
-    - Every role may stop the arms.
+      The rest of the address may lower the role, but never raise it.
 """
 
 import hmac

@@ -1,16 +1,12 @@
 """Plans the benchmark of control laws: which law runs in which task, over which link.
 
-The benchmark consists of cells. A cell is one control law in one task over one link (the delay
-and loss between the arms). It runs once per random seed. A task and a link are sets of
-overrides of a scenario that is shipped with the program, so `trilat sim` can reproduce every
-run.
+A task and a link (the delay and loss between the arms) are sets of overrides of a scenario that
+is shipped with the program, so `trilat sim` can reproduce every run. One law in one task over
+one link is called a cell. It runs once per random seed.
 
-One procedure, `trilat bench --tune`, tunes the gains of all laws and stores them in a file. It
-selects the gains with the smallest error among the choices that also stay stable if all delays
-grow by the factor `TUNING_MARGIN`. A study is a named selection of tasks, laws and links.
-
-The tuning of each law at each round trip is stored as soon as it has finished, so that an
-interrupted tuning continues.
+The gains of all laws are tuned by one procedure, `trilat bench --tune`, which stores them in a
+file. It selects the gains with the smallest error among those that also stay stable if all
+delays grow by the factor `TUNING_MARGIN`.
 
 Invariant:
     - Gains are never set by hand. They come from `trilat bench --tune` only.

@@ -1,12 +1,14 @@
-"""Executes the runs of the benchmark suite: judges and measures each run, and stores it.
+"""Executes the runs of the benchmark suite, decides whether each is stable, and measures it.
 
-A run is judged as its stability certificate would judge it (`analysis.judge`): by its
-end, by the characteristic roots of its loop, and by its twins where they matter. A twin is a
-repetition of the run with a small disturbance, which shows whether disturbances grow.
-A run is made longer if its judgement needs more time: it then lasts for `TIME_CONSTANTS` of its
-slowest time constants. A run that is not stable is repeated over twice its length. Errors,
-efforts and forces are measured over the time of the task only, from the same records that
-`trilat sim` writes.
+`run_bench` is called with a plan of runs and a folder, in which finished runs are stored.
+Whether a run is stable is decided as by `trilat certify`: from the end of the run, from the
+characteristic roots of its control loop, and where these do not suffice, from repetitions of
+the run with a small push, which show whether disturbances grow.
+
+Some runs are too short for a decision. They are repeated with a duration of `TIME_CONSTANTS` of
+their slowest time constants. A run that is not stable is repeated over twice its length.
+Errors, efforts and forces are measured over the time of the task only, from the same records
+that `trilat sim` writes.
 
 Invariant:
     - The numbers of a run depend on its scenario alone. The number of processes, their order

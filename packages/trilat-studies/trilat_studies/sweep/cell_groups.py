@@ -1,9 +1,10 @@
-"""Divides the cells of a sweep into groups whose runs differ in numbers only.
+"""Orders the runs of a sweep so that many of them can be simulated side by side.
 
-Runs that differ in numbers only, for example in a gain, can be computed side by side. An axis
-may also change the structure of the scenario: the control law, the joints of an arm, the sites
-or their tick rates. The cells are then run group by group, so that every worker gets runs of
-one structure.
+A sweep runs a scenario with many combinations of parameters, called cells. Runs that differ in
+numbers only, such as a gain or a delay, share the vector instructions of the processor. A
+parameter may also change the structure of the scenario: the control law, the joints of an arm,
+the sites or their tick rates. This module divides the cells into groups of one structure, which
+run one after the other.
 
 Invariant:
     - Every cell of the grid belongs to exactly one group.

@@ -1,9 +1,9 @@
-"""Chooses the cells of a sweep that lie along the stability edge.
+"""Chooses the runs of a sweep that locate the edge between stable and unstable parameters.
 
-A sweep runs a scenario on a grid of parameters, and a cell is one point of this grid. The
-stability edge separates stable from unstable cells. A refined sweep first runs a coarse part of
-the grid. Then it halves the boxes that the edge crosses, again and again, until their corners
-are neighbours in the grid.
+A map of 201 by 201 parameter values needs 40 401 runs, most of which lie far from the edge. A
+refined sweep runs a coarse part of this grid. Then it halves the boxes that the edge crosses,
+again and again, until their corners are neighbours in the grid. A cell is one point of the
+grid.
 
 Invariant:
     - The chosen cells are a function of the plan and of the results. They do not depend on the

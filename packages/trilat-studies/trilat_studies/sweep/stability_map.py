@@ -1,12 +1,11 @@
 """Builds a stability map, which shows for which parameters a scenario is stable.
 
-A sweep runs one scenario, the description of an experiment, at every point of a grid of
-parameters, usually with several random seeds. The map draws the first two numeric parameters as
-axes x and y. Each combination of the other parameters and of the control law gets a panel. Each
-grid point of a panel shows how many of its runs were stable. A column is the set of grid points
-with the same x.
+A sweep runs one scenario at every point of a grid of parameters, usually with several random
+seeds. The map draws the first two numeric parameters as axes x and y. Each combination of the
+other parameters and of the control law gets a panel. Each grid point of a panel shows how many
+of its runs were stable. A column is the set of grid points with the same x.
 
-Limits from theory are drawn as lines:
+Limits from theory are drawn as lines, so that they can be compared with the runs:
 
 - The closed-form line is where a stability criterion in closed form is just met. It is used
   only if all assumptions of the criterion hold. For the proportional law with damping, P+d, the
@@ -22,8 +21,6 @@ Invariant:
       the other not. If undecided grid points lie between the two, the edge is wider.
     - A line crosses a column between two neighbouring grid points, of which the theory calls
       exactly one stable.
-    - The label of an axis names the scenario key with its unit. A gain has the unit that its
-      control law states.
 """
 
 import math

@@ -1,10 +1,9 @@
 """Plans a sweep: the runs of one scenario over a grid of parameters, control laws and seeds.
 
-A scenario is the description of an experiment. An axis is a key of the scenario together with
-the values that the key should have, such as "link.delay_ms=0:400:50". A cell is one combination
-of the values of all axes and of a control law. Each cell is run once per seed of the random
-numbers. This module parses the axes, laws and seeds, combines them with the scenario, and
-checks the result before anything runs.
+For example, the text "link.delay_ms=0:400:50" makes the network delay an axis of the grid, with
+the values 0 to 400 ms. One combination of the values of all axes and of a control law is called
+a cell. Each cell is run once per random seed. This module parses the axes, laws and seeds,
+combines them with the scenario, and checks the result before anything runs.
 
 Invariant:
     - A plan that cannot run is refused before the first run.

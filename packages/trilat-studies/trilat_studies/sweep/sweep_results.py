@@ -1,18 +1,14 @@
-"""Stores and summarises the results of a sweep.
+"""Stores and summarises the results of a sweep over a grid of parameters.
 
-A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
-one combination of the swept parameters and the control law; it is run once per seed of the
-random numbers. This module turns the finished runs into a table with one row per run and writes
-it as CSV. It also combines the runs of a cell to a grid point, prints a summary, and finds the
-command that repeats a run.
+A sweep runs a scenario at every point of the grid. One point of the grid, called a cell, is run
+once per random seed. This module turns the finished runs into a CSV table with one row per run.
+It also combines the runs of a cell, prints a summary, and finds the command that repeats a run.
 
 Invariant:
-    - The results are a function of the plan. The bytes of the result files depend on the runs
-      alone, and not on the time or the number of worker processes.
+    - The bytes of the result files depend on the runs alone, and not on the time or the number
+      of worker processes.
     - Reading the CSV table restores all numbers bit for bit.
     - Running the scenario of a row again reproduces the row.
-    - A grid point counts each of its runs once. The stable share is the fraction of the decided
-      runs that are stable. Its 95 % Wilson interval lies within [0, 1].
     - Every printed command reproduces the run, with the same hash of the scenario as its row.
       If the source of the scenario has changed since the sweep, the command names a file to
       which the scenario of the row was written.

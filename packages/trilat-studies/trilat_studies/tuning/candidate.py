@@ -14,14 +14,14 @@ arms would agree if gravity did not act on them:
 Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
 weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
 
-A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. For
-such a law, the distance between the arms is replaced by the distance of each arm from the
-promised motion, and a run is judged by where the promised motion ends instead of q*. The
-distance of the mean from q* stays part of the error, so that arms that do not move at all are
-no solution.
+A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. Then the
+distance of each arm from the promised motion counts instead of the distance between the arms,
+and a run is judged by where the promised motion ends. The distance of the mean from q* stays
+part of the error, so that arms that do not move at all are no solution.
 
-Walls, and operators who push without a target, do not determine a pose. If a scenario has them,
-its twin is run too, which is the same scenario without them.
+Walls, and operators who push without a target, do not determine a pose. A scenario that
+contains them is also run without them, to find the pose at which the arms would come to rest.
+This second scenario is called the twin of the first.
 
 Invariant:
     - A score is a function of the scenario alone. The errors of a run that does not reach its
@@ -29,10 +29,6 @@ Invariant:
     - Neither gains nor control laws enter q*.
     - Only settled runs, which are stable and end at q* or at the pose that their law promises,
       may be part of a Pareto front.
-    - The end of a log is reported if an arm hangs down (both of its links point down) and did
-      not hang at the start, even if all arms are close to each other. It is also reported if
-      the mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
-      explain the distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
