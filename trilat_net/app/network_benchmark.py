@@ -534,8 +534,8 @@ class NetworkBenchmark(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table and the verdicts that `trilat ping --benchmark` prints.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
         """
         from ..presentation import compose_benchmark
 

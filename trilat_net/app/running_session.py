@@ -387,7 +387,7 @@ class RunningSession:
         )
 
     def end(self) -> list[str]:
-        """Ends the session regularly, as `trilat stop --end` does.
+        """Ends the session in an orderly way, as `trilat stop --end` does.
 
         All sites end at the same time of the session, about half a second from now.
 
@@ -738,7 +738,7 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures the network of the session, as `trilat ping` does.
+        """Measures round trip times and clock offsets of the session, as `trilat ping` does.
 
         Args:
             count: Number of pings to each member.
@@ -874,7 +874,7 @@ def open_hand(
     *,
     repeats: bool = True,
 ) -> Hand:
-    """Opens the connection through which a program moves an arm.
+    """Opens a connection to an arm, through which a program moves the arm as its operator.
 
     Args:
         bus: Network connection that reaches the site.

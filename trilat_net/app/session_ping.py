@@ -54,7 +54,7 @@ ns.
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Result of a measurement of a session's network.
+    """Measured round trips, clock offsets and delays of a session's network.
 
     Attributes:
         session: Name of the session.
@@ -78,8 +78,8 @@ class PingReport(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the tables of round trips that `trilat ping` prints.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
         """
         from ..presentation import compose_ping
 
@@ -325,8 +325,8 @@ class TopicDelays(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table of delays that `trilat ping --ros2` prints.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
         """
         from ..presentation import compose_topic_delays
 

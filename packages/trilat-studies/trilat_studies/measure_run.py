@@ -91,7 +91,7 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records after a time.
+        """Returns the records later than a given time.
 
         Args:
             t_ns: The time, in ns. A record at exactly this time is not returned.
@@ -100,7 +100,7 @@ class RecordBatch(NamedTuple):
         return self._slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records within an interval of time.
+        """Returns the records from one time up to another.
 
         Args:
             from_ns: Start of the interval, in ns, which belongs to the interval.
@@ -302,11 +302,11 @@ class _CompiledRun:
         return run.ran_s >= self._scenario.duration_s or run.diverged_s is not None
 
     def find_next_end(self) -> float:
-        """Returns the end of the next batch, in s."""
+        """Returns the time up to which the next batch is simulated, in s."""
         return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
 
     def pass_records(self) -> None:
-        """Passes the records since the last call to the receivers."""
+        """Passes the records since the last call to the receiver of each site."""
         no_columns = slice(0, 0)  # for vectors that the site does not have
         records_of_sites = self.run.pop_records()
         for name, site_records in zip(self._scenario.names, records_of_sites, strict=True):
@@ -326,7 +326,7 @@ class _CompiledRun:
 
 
 class WholeRun(NamedTuple):
-    """A simulated run with all of its records.
+    """A simulated run of which all records were kept in memory, for measures of the whole run.
 
     Attributes:
         records: Records of each site, by its name.
@@ -706,7 +706,7 @@ class SiteStats:
         return ages
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second of the run.
+        """Returns the records of the last second of the run, for the metrics `end_...`.
 
         Args:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier

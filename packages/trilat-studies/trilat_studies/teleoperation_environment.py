@@ -110,7 +110,7 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Judgement of a step by the task of the episode.
+    """Result of a step of an episode: its reward, and whether the task is done or has failed.
 
     Attributes:
         reward: Reward of the step.
@@ -277,7 +277,9 @@ class _ActedHand(HandPlayer):
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
-    """An environment in which a policy operates one arm; its arguments are those of `make_env`.
+    """A Gymnasium environment in which a policy operates one arm of a simulated session.
+
+    `make_env` creates this object and explains its arguments.
 
     Attributes:
         observation_names: With `flat`, the name of each number of an observation, as in
@@ -575,7 +577,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
-        """Returns whether the end effector of a site can reach a position.
+        """Returns True if the end effector of a site can reach a position.
+
+        Tasks that draw random goals use it.
 
         Args:
             q: Joint angles of each site, from which the search for a pose starts, in rad.
@@ -591,7 +595,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
-        """Returns observations in the form of the observation space.
+        """Returns observations as the policy gets them: a dictionary, or one array with `flat`.
 
         Args:
             parts: The parts of an observation by name, or those of several observations, which
@@ -750,7 +754,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def judge(self, scene: Scene) -> Judgement:
-        """Returns the judgement of a step by the task.
+        """Asks the task of the episode for the reward of a step, and whether it is done.
 
         Args:
             scene: State after the step.
@@ -765,22 +769,23 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     @property
     def run(self) -> FusedRun:
-        """The simulated run of the episode."""
+        """The simulated run of the episode, which a vector environment may advance."""
         return self._run
 
     @property
     def total_ticks(self) -> int:
-        """Number of ticks of an episode that ends by its duration."""
+        """Number of ticks (control periods) after which the duration of an episode is over."""
         return self._ticks
 
     @property
     def plants(self) -> Mapping[str, Any]:
-        """Users' programs that move arms, by site."""
+        """User-written models of arms, by the name of the site that they belong to."""
         return self._plants
 
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:
-        """Notes steps of the episode that a vector environment computed.
+        """Records the actions of an episode that a vector environment has simulated.
 
+        The environment can then save or draw the episode as if it had made the steps itself.
         The state of `run` must be that after these steps.
 
         Args:
@@ -819,7 +824,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return clipped
 
     def clip_actions(self, values: Array) -> tuple[Array, Any]:
-        """Returns actions, clipped to their bounds, and which of them exceeded the bounds.
+        """Clips actions to their bounds, and reports which of them exceeded the bounds.
 
         Args:
             values: An action, or several actions, one per row, as the policy gave them.

@@ -677,6 +677,10 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
     """Encodes the results of trials as a JUnit XML document, which build servers display.
 
+    The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
+    run. A case has one `failure` with all unmet expectations, or an `error` if the run has no
+    result.
+
     Args:
         report: The results.
         began_unix_ns: Start of the trials in Unix time, in ns.

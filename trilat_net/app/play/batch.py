@@ -234,7 +234,7 @@ class BatchBuilder:
 
     @property
     def memory(self) -> int:
-        """Memory of all messages, in bytes."""
+        """Memory that the messages added so far need, in bytes."""
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:

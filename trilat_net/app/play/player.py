@@ -104,7 +104,7 @@ def parse_rate(text: str) -> float:
 
 
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
-    """Waits until a deadline.
+    """Waits until a deadline: sleeps at first, and polls the clock shortly before the deadline.
 
     Args:
         clock: The clock.

@@ -127,7 +127,9 @@ class ExperimentAnalysis(Result):
     """The statistics of an experiment: comparisons of its conditions, and facts of the study.
 
     Creating this object computes everything except the figures, which `write` draws. A unit is
-    a participant or a pair, whichever is sampled independently.
+    a participant or a pair, whichever is sampled independently. Every measure that trials have
+    is summarised, also if all its values are equal. If numbers of a measure are missing, their
+    number is stated.
 
     Args:
         experiment: The experiment in its folder.

@@ -383,7 +383,8 @@ class Role:
 class RoleLinks:
     """Makes the links that open a page, and finds out which role a link grants.
 
-    A link contains a secret token, so that only those who received it can open the page. The
+    A link contains a secret token, so that only those who received it can open the page. A
+    token is needed on this machine too, because other users of the machine can connect. The
     token of a role is computed from a random secret, so that it need not be stored.
     """
 

@@ -372,7 +372,7 @@ Without it, a law that comes to rest slowly would appear to be unstable.
 
 
 class TunedGains(msgspec.Struct, frozen=True):
-    """The gains of a law in a form of the suite, tuned at one round trip.
+    """Gains of a control law, tuned for one kind of scenario and one round trip of the network.
 
     The procedure tries `tried` candidates. Of those that come to rest at the pose of the task,
     and still do so when delays grow by `TUNING_MARGIN`, it selects the candidate with the
@@ -417,7 +417,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Converts overrides to strings KEY=VALUE, in the form that the command line accepts.
+    """Converts overrides of a scenario to texts KEY=VALUE, as the command line accepts them.
 
     Args:
         settings: Values by key of the scenario.
@@ -788,7 +788,7 @@ class BenchPlan(NamedTuple):
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns the cell with a name.
+        """Returns the part of the plan for one law in one task over one link, by its name.
 
         Args:
             name: Name of the cell, as in "contact/wave/rtt272": task, law and link.

@@ -44,7 +44,7 @@ LEAST_SEEDS = 20
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns the name of a cell's runs in the journal of finished runs.
+    """Returns the name under which the journal of finished runs stores the runs of a cell.
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
@@ -379,7 +379,7 @@ class BenchResults(Result):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of one cell of the suite.
+        """Returns the result of one law in one task over one link.
 
         Args:
             task: Name of the task.

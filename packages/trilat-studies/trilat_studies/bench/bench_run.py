@@ -128,10 +128,10 @@ class BenchRunItem(NamedTuple):
 
 
 class JudgedRun(NamedTuple):
-    """A run of the suite with all of its records, and the judgement whether it is stable.
+    """A run of the benchmark with all of its records, and the decision whether it is stable.
 
-    The judgement takes twins into account where they matter: repeated runs with a small
-    disturbance, which show whether disturbances grow.
+    If the characteristic roots do not decide, twins do: repetitions of the run with a small
+    push, which show whether disturbances grow.
 
     Attributes:
         scenario: Scenario of the run. Its duration is that of the run.
@@ -209,7 +209,7 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
 
 
 def judge_bench_run(scenario: Scenario, length_s: float) -> JudgedRun:
-    """Executes a scenario, and judges the run as its certificate would.
+    """Simulates a scenario, and decides whether the run is stable as `trilat certify` would.
 
     Args:
         scenario: The scenario. Its own duration is ignored.

@@ -157,7 +157,7 @@ def iterate_cells(
 
 
 def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
-    """Yields the rows of the runs of one cell.
+    """Yields the table rows of one cell, a combination of swept parameters: one row per run.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

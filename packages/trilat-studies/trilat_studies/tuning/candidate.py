@@ -78,9 +78,10 @@ _POSE_SAMPLES_HZ = 100.0
 
 
 def check_comparable(scenario: Scenario) -> None:
-    """Checks that control laws can be compared fairly in a scenario.
+    """Refuses a scenario in which control laws cannot be compared fairly.
 
-    The comparison needs a pose that all arms could reach.
+    The error of a law is measured from the pose on which the arms should agree. Therefore the
+    scenario must determine a pose that all arms could reach.
 
     Args:
         scenario: The scenario in which laws are to be compared.

@@ -70,9 +70,9 @@ ObjectivePoint = tuple[float, float]
 
 
 class Objective(StrEnum):
-    """Quantity that the search minimises together with the effort of the controllers.
+    """Quantity that a tuning minimises besides the motor effort: error or settling time.
 
-    Both conflict in general: a smaller error needs larger torques.
+    Both conflict with the effort in general: a smaller error needs larger torques.
     """
 
     ERROR = "error"
@@ -84,7 +84,7 @@ class Objective(StrEnum):
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns the point of a candidate in the plane of objective and effort.
+        """Returns the objective and the effort of a candidate, as a point for its Pareto front.
 
         Args:
             score: Score of the candidate.
