@@ -23,7 +23,9 @@ from .site_parts import SiteParts
 
 
 class PeerAdmission:
-    """Keeps account of the peers that take part in the session of a running site.
+    """Decides in a running session from which tick on samples of a restarted peer are used.
+
+    A peer is another site of the session.
 
     Args:
         parts: Parts of the site.

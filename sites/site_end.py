@@ -63,7 +63,7 @@ class RunOutcome(NamedTuple):
 
 
 class SiteEnd:
-    """The end of a site, from the last tick of its control loop to the end of its process.
+    """Ends a site: publishes the result, waits for the recorders, and informs the user.
 
     Args:
         parts: Parts of the site.

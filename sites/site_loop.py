@@ -445,9 +445,10 @@ class StateBlock:
 
 
 class _LoopSite(Protocol):
-    """The site whose ticks the loop executes, as far as the loop knows it.
+    """What the loop requires of a site: the methods that it calls in a tick and between ticks.
 
-    `RunningSite` is the site of a session. The loop ignores the results that are `object`.
+    `RunningSite` has them in a session, and `loop_rehearsal` replaces them. The loop ignores
+    the results that are `object`.
     """
 
     def should_stop(self) -> bool:

@@ -1,9 +1,9 @@
 """Defines the command-line options that several commands share.
 
-The options select a scenario, a network connection or a log. Options that belong together are
-fields of a named tuple, for instance `Reach`, which describes how a command reaches a session.
-A command that has a parameter of such a type accepts all options of the type
-(`expand_option_tuples`). The methods of the tuple then open the connection or read the file.
+They select a scenario, a network connection or a log. Options that belong together are fields
+of a named tuple. For example, the fields of `Reach` say how a command reaches a session. A
+command that has a parameter of this type accepts all of its options (`expand_option_tuples`),
+and the methods of the tuple then open the connection or read the file.
 """
 
 import inspect

@@ -39,7 +39,9 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Converts times in the log to deadlines on the clock, by a linear function.
+    """Converts times in a log to the times on the clock at which messages are published.
+
+    The conversion is a linear function of the start time and the speed of playing.
 
     Attributes:
         origin_ns: Deadline of the time `start_ns` on the clock, in ns.

@@ -75,7 +75,7 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """Message of a page that it has drawn a frame and can receive another one.
+    """Message of a page that it has drawn the last frame, so that the next one can be sent.
 
     A frame is a message of the server that describes the present state of the session.
 
@@ -325,7 +325,7 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """States who uses a page: which rights the user has, and which arms the page shows.
+    """The rights of the person at a page, and the arm whose user's view the page shows.
 
     Attributes:
         kind: An experimenter may do everything, a user may hold the arm of one site, and a
@@ -456,9 +456,10 @@ class RoleLinks:
 
 
 class PageHands:
-    """Holds and moves arms on behalf of one page.
+    """Moves the arms that the person at one page holds.
 
-    The page's own messages serve as heartbeat: if they stop, the site releases the arm.
+    The messages of the page serve as heartbeat: if they stop, for example because the page was
+    closed, the site releases the arm.
 
     Args:
         bus: Network connection that reaches the session.
@@ -541,7 +542,10 @@ class _OpenQuery(NamedTuple):
 
 
 class OrderDesk:
-    """Sends the orders of all pages to the sites, and collects the replies of the sites.
+    """Sends the requests of all pages to the sites, one at a time, and collects their replies.
+
+    A site is a process that controls one arm. A request changes, for example, the delay of a
+    link.
 
     Args:
         bus: Network connection that reaches the session.

@@ -773,10 +773,7 @@ class BenchPlan(NamedTuple):
 
     @property
     def links(self) -> list[str]:
-        """Names of the links over which the benchmark runs, each once, in running order.
-
-        These are also the columns of its figures.
-        """
+        """Names of the network links of the benchmark, in the order of its figures."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
@@ -898,7 +895,7 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Returns why the benchmark has no run of a control law in a task, as the tables print it.
+    """Explains why the benchmark has no run of a control law in a task, for the tables.
 
     Args:
         law: Name of the control law.

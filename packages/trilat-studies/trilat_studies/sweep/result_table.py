@@ -1,7 +1,7 @@
-"""Reads and writes the table of results of a sweep, `results.csv`, one row at a time.
+"""Writes and reads results.csv, the table of a sweep with one row per run, without loading it.
 
-A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore a
-table is written row by row, and the rows of a large table stay in its file.
+A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore
+rows are written one by one, and a large table stays in its file while it is used.
 
 Invariant:
     - Reading the CSV table restores all numbers bit for bit.

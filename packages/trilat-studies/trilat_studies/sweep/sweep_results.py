@@ -99,9 +99,7 @@ class SweepResults(Result):
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
-        """Returns the runs of one cell, one row per seed.
-
-        A cell is a combination of the values of all axes and of a control law.
+        """Returns the table rows of one combination of parameter values, one row per seed.
 
         Args:
             number: Number of the cell.
@@ -287,7 +285,7 @@ GRID_POINTS_FILE = "places.csv"
 
 
 class GridPoint(NamedTuple):
-    """The results of all runs of one cell of a sweep, which differ only in their seeds.
+    """Summary of all runs with the same parameter values, which differ only in their seeds.
 
     Attributes:
         cell: Number of the cell, from 0.
@@ -336,9 +334,10 @@ class GridPoint(NamedTuple):
 
 
 def list_totals(plan: SweepPlan) -> list[str]:
-    """Lists the keys of the quantities that are averaged over the seeds of a cell.
+    """Lists the measured quantities of which a sweep computes means over the seeds.
 
-    These are the totals that every run computes, and the metrics that the sweep requested.
+    They are the totals that every run computes, such as its RMS error, and the metrics that the
+    sweep requested.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

@@ -409,7 +409,9 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """Measured score of a candidate. docs/reference/tuning-procedure.md has the formulas.
+    """What was measured about a control law with chosen gains: error, effort and class.
+
+    docs/reference/tuning-procedure.md has the formulas.
 
     Attributes:
         outcome: Class of the candidate.
@@ -743,7 +745,7 @@ def _rms(values: Array) -> float:
 
 
 class TuningScenario(NamedTuple):
-    """The scenario in which control laws are compared, with the overrides that produced it.
+    """The scenario in which control laws are compared, and the overrides that changed it.
 
     The overrides are kept so that commands can name the scenario as the user did.
 
