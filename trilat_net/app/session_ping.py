@@ -87,11 +87,10 @@ class PingReport(Result):
 
 
 class SessionPing:
-    """Measures the network of a session once.
+    """Measures once the round trip times to a session's processes, and its link delays.
 
-    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`.
-
-    The caller takes part in no control loop. It learns the members from their replies to a
+    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`. The
+    measurement takes part in no control loop. It learns the members from their replies to a
     query, measures the round trips to them by pings, and reads the delays of the links from the
     statistics that the sites publish.
 
@@ -244,7 +243,7 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures the network of a running session once.
+    """Measures the network of a running session once, and returns round trip times and delays.
 
     Args:
         connection: Endpoints of the session, and keys.

@@ -64,10 +64,12 @@ _VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
 
 
 class RecordBatch(NamedTuple):
-    """Consecutive records of one site, as one array per quantity.
+    """Results of consecutive ticks of one arm, as one array per quantity.
 
-    K is the number of records, n the number of joints, m the number of coordinates that the
-    sites agree on, and P the number of peers, the other sites whose states this site receives.
+    Metrics are computed from such batches, because statistics of arrays are much faster than
+    those of single records. K is the number of records, n the number of joints, m the number of
+    coordinates that the sites agree on, and P the number of peers, the other sites whose states
+    this site receives.
 
     Attributes:
         t_ns: Nominal times, shape (K,), in ns.
@@ -144,7 +146,7 @@ class RecordBatch(NamedTuple):
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Concatenates consecutive batches of one site to a single batch.
+    """Joins consecutive batches of records of one site to a single batch.
 
     Args:
         batches: Batches in the order of time, at least one.
@@ -359,7 +361,10 @@ _RECORD_ROWS = 1 << BATCH_RECORDS.bit_length()
 def run_whole_together(
     scenarios: Sequence[Scenario],
 ) -> Iterator[tuple[int, WholeRun, str]]:
-    """Runs scenarios side by side where that is possible, and keeps all records in memory.
+    """Simulates several scenarios, as many as possible at once, and keeps all of their records.
+
+    Scenarios that differ in numbers only share the vector instructions of the processor. Each
+    run equals that of `run_whole` bit for bit.
 
     Args:
         scenarios: The scenarios.
@@ -413,7 +418,7 @@ def _join_run(
 
 
 class Range(NamedTuple):
-    """Smallest and largest value of a quantity during a window of time, to compare with limits.
+    """Smallest and largest value of a quantity in a part of the run, to compare with limits.
 
     A quantity with a single value, such as a mean, has this value as both ends.
     """
@@ -423,10 +428,10 @@ class Range(NamedTuple):
 
 
 class WindowStats:
-    """Running statistics of one site within a window of time.
+    """Statistics of one arm in a part of the run, for which the scenario states limits.
 
-    A scenario can state limits for parts of its run, each of which is a window in its table
-    [expect]. The statistics are updated batch by batch, so that no records need to be kept.
+    Such a part is called a window in the table [expect] of the scenario. The statistics are
+    updated batch by batch, so that no records need to be kept.
 
     Args:
         window: Period of the run, with the limits that apply to it.

@@ -110,7 +110,9 @@ It is half of the least force of the wall that counts as contact, so the slave k
 
 
 class BenchRunItem(NamedTuple):
-    """One run of the benchmark, as it is sent to a worker process. It can be pickled.
+    """Everything that a worker process needs to execute one run of the benchmark.
+
+    The object can be pickled, and is thus sent to the process.
 
     Attributes:
         cell: The task, control law and link of the run, with the tuned gains.

@@ -331,8 +331,13 @@ _POSE_SAMPLES = 2000
 def check_final_posture(log: Log) -> list[str]:
     """Warns if the end of a run says little about its control law.
 
-    The warnings concern a run that is shorter than planned, and arms that hang down or fell.
-    The errors and torques of such arms are small, but not because of the control law.
+    There are three warnings:
+
+    - The run is shorter than planned.
+    - An arm hangs down (both of its links point down) and did not hang at the start. Its errors
+      and torques are small, but not because of the control law.
+    - The mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
+      explain the distance.
 
     Args:
         log: Log of the run.
@@ -825,7 +830,7 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """The runs of a control law with chosen gains, as they are sent to a worker process.
+    """Everything that a worker process needs to run a control law with chosen gains.
 
     Attributes:
         runs: For each random seed, the text of the scenario, and the text of the same scenario
