@@ -1,10 +1,9 @@
-"""Replies to requests to change something while a site runs.
+"""Replies to requests of users who change something while an arm is running.
 
-A site is a process that controls one robot arm. During a run, users can change the network
-links, change the weights with which a site follows its peers, end the run early, stop or enable
-an arm, and mark a moment in the log. They send these requests to the site that runs the arm.
-Before each tick of its control loop, the site checks the requests that have arrived, and
-replies to each of them.
+For example, `trilat set` changes the delay of a network link, and `trilat stop` stops an arm.
+Such a command sends a request to the site, the process that controls the arm. Before each tick
+of its control loop, the site checks the requests that have arrived, and replies to each of
+them.
 
 Invariant:
     - Every request gets a reply: it is accepted, or refused with a reason. An accepted change

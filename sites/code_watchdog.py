@@ -1,13 +1,11 @@
-"""Limits the computing time of a user's own code: a control law, an operator or a plant.
+"""Limits the computing time of a user's code: a control law, an operator or an arm model.
 
-A site is a process that controls one arm. An operator is a program that moves an arm, and a
-plant is a model of an arm. A site calls such code in its control loop. Slow code would
-therefore make the ticks of the loop late. Each call may take 75 % (`SHARE`) of the period at
-which the code is called. If a call takes longer, the excess is added to the overtime. If it
-takes less, the overtime is reduced by the unused time. If the overtime exceeds
-`OVERTIME_LIMIT_NS`, the code is too slow, and the run ends with an error. One call counts for
-at most `HICCUP_NS`, so that a single slow call, for example during garbage collection, does not
-end the run.
+The control loop of an arm calls such code, and slow code would make its ticks (periods) late.
+Each call may take 75 % (`SHARE`) of the period at which the code is called. If a call takes
+longer, the excess is added to the overtime. If it takes less, the overtime is reduced by the
+unused time. If the overtime exceeds `OVERTIME_LIMIT_NS`, the code is too slow, and the run ends
+with an error. One call counts for at most `HICCUP_NS`, so that a single slow call, for example
+during garbage collection, does not end the run.
 
 If the operating system has interrupted the thread during a call, the computing time of the
 thread counts instead of the elapsed time. The load of the machine by other programs is thus no

@@ -1,4 +1,4 @@
-"""Receives the measurements of an external arm and the state of its dead-man switch.
+"""Receives the measurements of a real arm and of its dead-man switch, and stops it if they end.
 
 An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
 in another program. Its driver sends the measured joint positions to the site, the process that
@@ -9,10 +9,9 @@ orders for the site from it: to hold the position, to stop, or to continue.
 Invariant:
     - A received message cannot raise an error in the control loop. The queue of messages is
       bounded.
-    - Only the newest measurement is used. The site does not start without a measurement. It
-      holds its position after `HELD_SILENCE_NS` without a measurement, and enters the mode
-      "fault" after `SILENCE_LIMIT_NS`, because the torque would no longer fit the state of the
-      arm.
+    - The site does not start without a measurement. It holds its position after
+      `HELD_SILENCE_NS` without a measurement, and enters the mode "fault" after
+      `SILENCE_LIMIT_NS`, because the torque would no longer fit the state of the arm.
     - A measurement that the arm cannot have reached since the previous one is dropped, and does
       not count as received, because the sensor or the driver must be faulty.
     - A switch that has sent nothing for `SWITCH_SILENCE_NS` counts as released.

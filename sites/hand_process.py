@@ -1,13 +1,13 @@
-"""Runs a user's own operator class in a process that moves the arm of a site.
+"""Runs a user's own operator, a Python class that decides how to move an arm, in a process.
 
-An operator is the person or program that moves an arm. A user can write an operator as a Python
-class whose method `act` receives a view, which is the present state of the site, and returns a
-target or a force. The site sends views over the network at regular intervals, and this process,
-the command `trilat hand`, replies with the decisions of the class.
+The method `act` of the class receives a view, which is the present state of the arm and of the
+others, and returns a target or a force. The process of the arm sends views over the network at
+regular intervals. This process, the command `trilat hand`, replies with the decisions of the
+class.
 
 Invariant:
-    - Each decision names the tick of its view. The site applies the decision a fixed time after
-      that tick, so that delays on the network do not change the run.
+    - Each decision names the tick of its view. It takes effect a fixed time after that tick, so
+      that delays on the network do not change the run.
     - Views that are too old to be answered in time are skipped, so that a slow class does not
       fall further and further behind.
     - If the class fails, the arm is released and the process ends. If the process is killed,
@@ -52,7 +52,10 @@ _VIEWS_KEPT = 64
 
 
 class HandProcess(SiteClient):
-    """Connection between a user's operator class and the site whose arm it moves.
+    """Connects an operator that a user wrote with the site (process) whose arm it moves.
+
+    The caller calls `serve` repeatedly. Each call replies to one view, a state that the site
+    has sent.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.

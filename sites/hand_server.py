@@ -1,9 +1,9 @@
-"""Receives the target positions or forces of the operator who moves the arm of a site.
+"""Receives, at the process of an arm, the commands of the operator who moves the arm.
 
-An operator is a person or a program. The operator's goals, which are target positions or
-forces, arrive as messages over the network. `HandServer` receives them from people and programs
-that connect to the session. `RemoteHand` receives them from a Python class of the user that
-runs in a process of its own, and sends the state of the site to that process.
+An operator is a person or a program, and commands a target position or a force by messages over
+the network. `HandServer` receives the commands of people and programs that connect to the
+session. `RemoteHand` receives those of a Python class of the user that runs in a process of its
+own, and sends the state of the arm to that process.
 
 Invariant:
     - A message cannot raise an error in the control loop, and each tick reads a limited number
@@ -116,7 +116,7 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Reads the waiting messages of operators, and returns how to move the arm now.
+        """Reads the waiting messages of operators, and returns how to move the arm.
 
         Args:
             k: Number of the tick, a period of the control loop.
@@ -242,9 +242,7 @@ class RemoteHand(HandPlayer):
         return super().track(site, k)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Sends the present state of the site to the user's process, to request a decision.
-
-        The decision says how the user's class moves the arm.
+        """Sends the state of the arm to the user's process, to request its next decision.
 
         Args:
             k: Number of the present tick, a period of the control loop.

@@ -1,4 +1,8 @@
-"""Prints lines without making a control loop wait for the terminal."""
+"""Prints lines in a thread of its own, so that a control loop never waits for the terminal.
+
+A terminal may block a program that prints, for example while its user has paused the output.
+The control loop of an arm must not stop for that.
+"""
 
 import queue
 import threading

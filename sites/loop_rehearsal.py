@@ -1,7 +1,8 @@
-"""Runs the control loop of a single site without a network, to measure how late its ticks are.
+"""Measures how late the control loop of an arm runs on this machine, without a network.
 
-A tick is one period of the control loop. It is late if it begins after the time at which it was
-due. The loop does the same work as in a session, except that no messages are exchanged.
+`trilat doctor` uses it to find the highest tick rate that the machine achieves. A tick is one
+period of the control loop, and is late if it begins after the time at which it was due. The
+loop does the same work as in a session, except that no messages are exchanged.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
-"""Warns before a session if the processors of this machine are busy with other programs.
+"""Warns before a session if other programs keep the processors of this machine busy.
 
-The load is measured for 0.2 s, from the statistics that Linux provides in /proc/stat. On other
-operating systems there is no warning.
+On a busy machine, control loops run late. The load is measured for 0.2 s, from the statistics
+that Linux provides in /proc/stat. On other operating systems there is no warning.
 """
 
 from contextlib import suppress

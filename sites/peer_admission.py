@@ -1,7 +1,9 @@
-"""Admits peers that join or rejoin a running session, and notices peers that stay away.
+"""Admits arms that join or rejoin a running session, and notices arms that stay away.
 
-A site is a process that runs one arm, and its peers are the other sites. A boot is a number
-that identifies one start of a process.
+Each arm is controlled by a process of its own, its site. If such a process has crashed and is
+started again, the other sites must know from which tick on they use its messages. The modules
+`peer_monitor` and `peer_admission` share this work: the first notices processes, the second
+changes whose samples the control loop uses.
 
 Invariant:
     - From the tick that an admitted peer has announced, samples of its new process are
@@ -21,7 +23,9 @@ from .site_parts import SiteParts
 
 
 class PeerAdmission:
-    """Keeps account of the peers that take part in the session of a running site.
+    """Decides in a running session from which tick on samples of a restarted peer are used.
+
+    A peer is another site of the session.
 
     Args:
         parts: Parts of the site.

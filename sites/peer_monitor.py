@@ -1,18 +1,17 @@
-"""Follows during a run which other processes join the session, leave it, and end.
+"""Follows which processes join a session, leave it, and end, while an arm is running.
 
-A process that takes part in the session is called a member. It is a site, which controls one
-robot arm, or a recorder. A process draws a random number at its start. It distinguishes the
-process from earlier and later processes with the same name.
+The members of a session are the sites, processes that control one arm each, and the recorders.
+A process draws a random number at its start, which distinguishes it from earlier and later
+processes with the same name.
 
 A site learns about the other members in two ways. They publish events. In addition, each has a
 liveliness token in the network (Zenoh), which disappears when the process ends or its
 connection is lost.
 
 Invariant:
-    - Two processes never act as the same site. The processes with which the session started are
-      members. If the scenario allows sites to leave and come back (value `glide` of its rule
-      for missing samples), a new process of a site is admitted, but only after the previous
-      process has disappeared or has published its end.
+    - Two processes never act as the same site. A new process of a site is admitted only after
+      the previous one has disappeared or has published its end, and only if the scenario allows
+      sites to come back (value `glide` of its rule for missing samples).
     - A recorder may join at any time.
 """
 

@@ -33,11 +33,10 @@ _MCL_ONFAULT = 4
 
 
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
-    """Requests all real-time settings for this process.
+    """Requests all real-time settings for this process, such as priority and locked memory.
 
-    Real-time settings, such as a high priority and memory that is never swapped to the disk,
-    make the control loop start its periods on time. Settings that are not permitted are left
-    out.
+    They make the control loop start its periods on time. Settings that the operating system
+    does not permit are left out.
 
     Args:
         cpu: Processor to which the process is bound. None permits all processors.

@@ -114,7 +114,9 @@ class ChannelBuffer:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Stores empty messages, for numbers under which the site never publishes a message.
+        """Stores empty messages in place of numbers that the site never publishes.
+
+        The numbers of later messages thus remain right.
 
         Args:
             count: Number of empty messages.

@@ -1,12 +1,14 @@
-"""Runs the control loop of a site, from the epoch to its last tick.
+"""Runs the control loop of one arm, from the start of the session to its last tick.
 
-A site is a process that runs one arm. `RunningSite` is what the loop in `site_loop` calls in
-every tick and ten times a second. Three other objects do the work that is no part of a tick:
-`SiteNews` reports what happens, `PeerAdmission` admits peers, and `SiteEnd` leaves the session.
+`RunningSite` is the object that the loop in `site_loop` calls in every tick (period of the
+loop), and ten times a second for work that is not urgent. Three other objects do what is no
+part of a tick: `SiteNews` reports events, `PeerAdmission` admits other arms, and `SiteEnd`
+leaves the session.
 
 Invariant:
-    - The housekeeping has a fixed order: replies to queries, clocks, members, news. An event
-      about a peer's clock thus precedes the admission that depends on it.
+    - The work that is not urgent has a fixed order: replies to queries, clocks, members, news.
+      An event about the clock of a peer (another arm) thus precedes the admission that depends
+      on it.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,11 @@
 """Leaves a session: publishes how a run ended, and waits until the recorders have stored it.
 
+The last messages explain why a run ended, for example because an arm left its limits. They
+would be lost if the process of the arm ended while a recorder still misses messages.
+
 Invariant:
-    - After its last tick, the process continues until every recorder that is present has
-      stored all messages of the site, or until a time limit. Otherwise the end of the log
-      could be lost.
+    - After its last tick, the process continues until every recorder that is present has stored
+      all its messages, or until a time limit.
     - The exit code of the process is determined by the run. A signal during the wait for the
       recorders only ends the wait.
 """
@@ -85,7 +87,7 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
 
 
 class SiteEnd:
-    """The end of a site, from the last tick of its control loop to the end of its process.
+    """Ends a site: publishes the result, waits for the recorders, and informs the user.
 
     Args:
         parts: Parts of the site.

@@ -1,9 +1,9 @@
-"""Real-time control loop of a site, and the queue of the samples that its peers send.
+"""Runs the control loop of an arm in real time, and queues the states that other arms send.
 
-A site is a process that runs one arm. In every tick (one period of the control loop), the loop
-sleeps until the tick is due, takes the samples that the peers have sent meanwhile, computes the
-torque, and publishes the state of its own arm: a sample for the peers, and a record of the tick
-for the recorder.
+The process of an arm is called a site. In every tick (one period of the control loop), the loop
+sleeps until the tick is due, takes the samples that the peers (other sites) have sent
+meanwhile, computes the torque, and publishes the state of its own arm: a sample for the peers,
+and a record of the tick for the recorder.
 
 Invariant (law L1 of docs/develop/design.md):
     - Tick k is due k periods after the epoch, the common start time of the session. The periods
@@ -445,9 +445,10 @@ class StateBlock:
 
 
 class _LoopSite(Protocol):
-    """The site whose ticks the loop executes, as far as the loop knows it.
+    """What the loop requires of a site: the methods that it calls in a tick and between ticks.
 
-    `RunningSite` is the site of a session. The loop ignores the results that are `object`.
+    `RunningSite` has them in a session, and `loop_rehearsal` replaces them. The loop ignores
+    the results that are `object`.
     """
 
     def should_stop(self) -> bool:

@@ -1,8 +1,7 @@
-"""Reports what happens at a site: events for the log and the other members, lines for the user.
+"""Reports what happens at an arm: events for the log and other processes, lines for the user.
 
-A site is a process that runs one arm. While its control loop runs, a `SiteNews` publishes an
-event for each change that took effect, such as a new delay or a new mode, and prints alarms
-and a status line.
+While the control loop of the arm runs, a `SiteNews` publishes an event for each change that
+took effect, such as a new delay or a new mode, and prints alarms and a status line.
 
 Invariant:
     - Every event is published after the record of the tick to which it belongs.

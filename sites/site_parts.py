@@ -1,9 +1,9 @@
-"""Creates the parts of a site, which exist from the start of its process to its end.
+"""Creates everything that the process of an arm needs before it joins a session.
 
-A site is a process that runs one arm and its control loop. `SiteParts` creates the site in the
-simulation kernel, the queues for incoming messages, the publishers, the buffer from which lost
-messages are sent again, and whatever else the scenario requires. `site_process` then joins the
-session with these parts.
+The process is called a site. `SiteParts` creates the arm and its control law in the simulation
+kernel, the queues for incoming messages, the publishers, the buffer from which lost messages
+are sent again, and whatever else the scenario requires. `site_process` then joins the session
+with these parts.
 
 Invariant:
     - When a `SiteParts` object has been created, all subscriptions of the site are declared and

@@ -1,10 +1,9 @@
-"""Runs one site as one process: joins a session, controls the arm, and leaves.
+"""Runs the process of one arm in a session: joins, controls the arm, and leaves.
 
-A site is a process that runs one arm and its control loop. `run_site` connects to the network,
-builds the parts of the site, agrees with the other members on the epoch (the time of tick 0),
-runs the loop, and waits until the recorders have stored everything.
-
-`running_site` runs the control loop, and `site_end` leaves the session.
+The process is called a site. `run_site` connects to the network, builds the parts of the site,
+agrees with the other members on the epoch (the time of tick 0), runs the control loop, and
+waits until the recorders have stored everything. The loop is in `running_site`, the end in
+`site_end`.
 
 Invariant:
     - A site announces itself only after it has declared its subscriptions and compiled its

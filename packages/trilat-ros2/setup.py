@@ -1,4 +1,7 @@
-"""States the version of the repository, in which this package has none of its own."""
+"""Builds this package with the version number of the main pyproject.toml.
+
+All packages of the repository have the same version, which is therefore written only once.
+"""
 
 import tomllib
 from pathlib import Path

@@ -1,4 +1,8 @@
-"""What people start: the command line, the Python interface, demo, doctor and player."""
+"""What users start: the command line, the Python interface, a demo, and checks of the machine.
+
+`cli` contains the `trilat` command, and `api` the functions of the package trilat_net. Each
+parses its arguments and calls the packages that do the work.
+"""
 
 from typing import TYPE_CHECKING
 

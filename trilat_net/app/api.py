@@ -1,8 +1,10 @@
-"""The Python interface: one function for each command that needs no network.
+"""The functions of `import trilat_net` that need no network, one for each such command.
 
-A scenario describes an experiment. It may be the name of a shipped scenario, the path of a TOML
-file, a TOML text, its tables, or a `Scenario`. A log is the record of a run. It may be the path
-of an MCAP file, or a `Log`. Functions that need a network are in the package `sites`.
+For example, `trilat_net.simulate("paper")` does what `trilat sim paper` does, and returns the
+log of the run. A function accepts a scenario (the description of an experiment) in any form:
+the name of a shipped scenario, the path of a TOML file, a TOML text, its tables, or a
+`Scenario`. A log is the path of an MCAP file, or a `Log`. Functions that need a network are in
+other modules.
 
 Invariant:
     - These functions only convert their arguments, and call the packages that do the work.

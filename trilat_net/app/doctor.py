@@ -514,9 +514,9 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if a site holds a tick rate although its ticks are late by some time.
+    """Returns True if a machine achieves a tick rate, judged by how late its ticks are.
 
-    It does so if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
+    The rate is achieved if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
 
     Args:
         rate_hz: The tick rate, in ticks (periods of the control loop) per second.
@@ -640,8 +640,8 @@ class DoctorReport(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the lines that `trilat doctor` prints, one per finding with its mark.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the lines is imported inside this method, because its import is
+        of no use to a program that only reads the findings.
         """
         from ..presentation import compose_doctor
 

@@ -54,10 +54,9 @@ def describe_site(
     ended: bool = False,
     silent_s: float = 0.0,
 ) -> SiteRow:
-    """Composes the row of a site from its newest record and statistics.
+    """Composes the table row of one arm: mode, joint angles, torque and so on, as texts.
 
-    A site is a process that runs one arm and its control loop. A row of the display shows the
-    state of one site.
+    The texts follow from the newest record and statistics of the arm's process, its site.
 
     Args:
         scenario: Scenario of the session.

@@ -1,14 +1,14 @@
-"""Measures a network before a session: round trips by message size, rate and transport.
+"""Measures a network before a session, and states whether it is good enough for a scenario.
 
-The near end, the process on this machine, sends messages to the far end, a process on another
-machine (`trilat ping --answer`), which sends each of them back at once. The near end measures
-the round trip times and counts the lost messages. The results are compared with the delay and
-the loss that a scenario tolerates. The command is `trilat ping --benchmark`.
+This process sends messages to a process on another machine (`trilat ping --answer`), which
+sends each of them back at once. The round trip times and the lost messages are measured for
+several message sizes, message rates and protocols, and compared with the delay and the loss
+that the scenario tolerates. The command is `trilat ping --benchmark`. The two processes are
+called the near end and the far end.
 
 Invariant:
     - The benchmark measures what a session would experience. Its messages have the size, rate,
-      priority and network settings of samples, the states that sites send to each other in
-      every tick.
+      priority and network settings of samples, the states that the arms send to each other.
     - The benchmark disturbs no session, because it uses a session name of its own.
 """
 
@@ -534,8 +534,8 @@ class NetworkBenchmark(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table and the verdicts that `trilat ping --benchmark` prints.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
         """
         from ..presentation import compose_benchmark
 

@@ -1,4 +1,8 @@
-"""Reads the scenario of a session for the recorder, which knows nothing of scenarios."""
+"""Gives the recorder a function that reads the scenario of the session that it records.
+
+The recorder stores messages, and must not depend on the modules that interpret scenarios. The
+program that starts the recorder therefore passes this function to it.
+"""
 
 from recorder import ReadScenario, RecordedScenario
 

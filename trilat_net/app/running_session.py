@@ -80,11 +80,11 @@ def _never_stopped() -> bool:
 
 
 class ShareHistory:
-    """Dominance factors of one site over time, with all changes that are known so far.
+    """Keeps the weights with which a site follows the others, over time and with all changes.
 
-    A dominance factor is the weight with which a site follows one of its peers. The scenario
-    states the factors at the start, and scripted changes. Users request further changes during
-    the session. Each change is a linear ramp from the present factors to other ones.
+    Such a weight is called a dominance factor. The scenario states the factors at the start,
+    and scripted changes. Users request further changes during the session. Each change is a
+    linear ramp from the present factors to other ones.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -387,7 +387,7 @@ class RunningSession:
         )
 
     def end(self) -> list[str]:
-        """Ends the session regularly, as `trilat stop --end` does.
+        """Ends the session in an orderly way, as `trilat stop --end` does.
 
         All sites end at the same time of the session, about half a second from now.
 
@@ -537,7 +537,7 @@ class RunningSession:
         return reply.text
 
     def change(self, site: str, request: ChangeRequest) -> ChangeReply:
-        """Requests a change, for example of a link, from the site that carries it out.
+        """Requests a change, such as another link delay, from the site that carries it out.
 
         Args:
             site: Name of the site.
@@ -699,10 +699,9 @@ class RunningSession:
 
     @contextmanager
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
-        """Subscribes to the weights with which a site follows its peers, as a context manager.
+        """Subscribes to the weights with which a site follows the others, as a context manager.
 
-        These weights, the dominance factors, may change during the session. The peers are the
-        other sites that the site follows.
+        These weights, the dominance factors, may change during the session.
 
         Args:
             site: Name of the site.
@@ -738,7 +737,7 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures the network of the session, as `trilat ping` does.
+        """Measures round trip times and clock offsets of the session, as `trilat ping` does.
 
         Args:
             count: Number of pings to each member.
@@ -874,7 +873,7 @@ def open_hand(
     *,
     repeats: bool = True,
 ) -> Hand:
-    """Opens the connection through which a program moves an arm.
+    """Opens a connection to an arm, through which a program moves the arm as its operator.
 
     Args:
         bus: Network connection that reaches the site.

@@ -54,7 +54,7 @@ ns.
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Result of a measurement of a session's network.
+    """Measured round trips, clock offsets and delays of a session's network.
 
     Attributes:
         session: Name of the session.
@@ -78,8 +78,8 @@ class PingReport(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the tables of round trips that `trilat ping` prints.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
         """
         from ..presentation import compose_ping
 
@@ -87,11 +87,10 @@ class PingReport(Result):
 
 
 class SessionPing:
-    """Measures the network of a session once.
+    """Measures once the round trip times to a session's processes, and its link delays.
 
-    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`.
-
-    The caller takes part in no control loop. It learns the members from their replies to a
+    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`. The
+    measurement takes part in no control loop. It learns the members from their replies to a
     query, measures the round trips to them by pings, and reads the delays of the links from the
     statistics that the sites publish.
 
@@ -244,7 +243,7 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures the network of a running session once.
+    """Measures the network of a running session once, and returns round trip times and delays.
 
     Args:
         connection: Endpoints of the session, and keys.
@@ -325,8 +324,8 @@ class TopicDelays(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table of delays that `trilat ping --ros2` prints.
 
-        The module for texts is imported only here, because programs that read values need no
-        text.
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
         """
         from ..presentation import compose_topic_delays
 

@@ -1,4 +1,9 @@
-"""Work in many runs: processes that share it, folders that keep it, and intervals."""
+"""Executes studies of many runs: worker processes, result folders, confidence intervals.
+
+A sweep, a tuning and a benchmark use this package. `executor` distributes their runs to worker
+processes, `study_folder` stores each finished run so that an interrupted study can continue,
+and `intervals` computes the uncertainty of the results.
+"""
 
 from typing import TYPE_CHECKING
 

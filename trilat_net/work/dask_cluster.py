@@ -86,7 +86,7 @@ def _find_sources() -> list[Path]:
 
 
 class WorkerRequirements(NamedTuple):
-    """What a worker of a cluster must have to compute the same results as this process.
+    """Program, arithmetic and files that a worker of a cluster must have for equal results.
 
     Attributes:
         identity: Properties that the worker must have.
@@ -163,7 +163,7 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks that this process, a worker of a cluster, computes the same results as the study.
+    """Checks in a worker of a cluster that it would compute the same results as this study.
 
     Args:
         required: Versions of the program and its packages, and files of control laws, that

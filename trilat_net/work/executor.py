@@ -68,7 +68,7 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Ignores a report of progress: a default for callers that have no progress display."""
+    """Does nothing with a report of progress, for callers that do not display any."""
 
 
 class _BatchResult(NamedTuple):
@@ -253,10 +253,11 @@ class _Feed(Generic[T]):
 
 
 class WorkerPool:
-    """The workers of a study: processes of this machine, or those of a cluster.
+    """Runs the items of a study in parallel, by processes of this machine or of a cluster.
 
-    A study is a large number of independent runs, called items. `open_worker_pool` creates this
-    object, and the study passes its items to `map` or `iterate_results`.
+    An item is an independent piece of work, such as one simulated run. `open_worker_pool`
+    creates this object. A study passes its items to `map`, or to `iterate_results` if it stores
+    each result at once.
 
     Args:
         executor: Executor that runs the batches. None if the items run in this process.
@@ -356,7 +357,7 @@ class WorkerPool:
         together: Together[T, R] | None = None,
         together_count: int = 1,
     ) -> list[R]:
-        """Runs a function on each item with all workers, and collects the results.
+        """Runs a function on each item with all workers, and returns all results.
 
         Args:
             function: Function at module level, so that another process can import it.
@@ -489,10 +490,10 @@ def open_worker_pool(
     laws: Sequence[Any] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
-    """Provides the workers of a study, for use in a `with` statement.
+    """Starts the worker processes of a study, or connects to those of a cluster.
 
-    The processes that were started end when the statement is left. Processes of a cluster keep
-    running.
+    The function is used in a `with` statement. The processes that were started end when the
+    statement is left. Processes of a cluster keep running.
 
     Args:
         jobs: Number of processes of this machine. None uses all cores, and 1 runs the items in
@@ -537,10 +538,9 @@ def open_worker_pool(
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:
-    """Checks that the user did not choose a number of processes for a cluster.
+    """Refuses the options --jobs and --on together, since --jobs has no effect on a cluster.
 
-    The option --jobs sets the number of processes of this machine, and has no effect if --on
-    selects a cluster.
+    The option --jobs sets the number of processes of this machine, and --on selects a cluster.
 
     Args:
         jobs: Value of --jobs. None if it was not given.

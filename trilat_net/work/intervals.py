@@ -1,4 +1,8 @@
-"""Computes 95 % confidence intervals over runs with many seeds, of a fraction and of a mean.
+"""Computes 95 % confidence intervals of a fraction and of a mean over several runs.
+
+If 9 of 10 runs with different random seeds are stable, the stable fraction is still uncertain.
+Studies print such a fraction with its Wilson interval, and a mean with its interval by
+Student's t distribution.
 
 Invariant:
     - An interval is a function of the numbers alone.

@@ -59,7 +59,9 @@ def build_resume_hint(*arguments: str) -> str:
 
 
 def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Returns rows as CSV text with a header. None becomes an empty field.
+    """Converts table rows to CSV text with a header.
+
+    None becomes an empty field.
 
     Args:
         rows: The rows, as values by column.
@@ -187,10 +189,10 @@ class StoredRuns(Mapping[tuple[Any, int], E]):
 
 
 class RunJournal(Generic[E]):
-    """File to which a study appends the result of each run as soon as it has finished.
+    """A file to which a study appends the result of each run as soon as it has finished.
 
-    If the study is interrupted, it continues from this file without repeating finished runs.
-    The object is a context manager that closes the file.
+    A sweep may take hours. If it is interrupted, it continues from this file without repeating
+    finished runs. The object is a context manager that closes the file.
 
     Args:
         path: Path of the file. Existing lines are read.
@@ -318,10 +320,9 @@ class RunJournal(Generic[E]):
 
 
 class StudyFolder(NamedTuple, Generic[P, E]):
-    """Folder with the plan, the journal and the results of a study.
+    """The folder of a study, such as a sweep, with its plan, the finished runs and the results.
 
-    A study is a set of simulated runs, such as a sweep over a parameter. It can be interrupted,
-    and continued from its folder.
+    `StudyFolder` is what a command needs to continue a study that was interrupted.
 
     Attributes:
         path: Path of the folder.

@@ -46,9 +46,10 @@ _TRIPS_KEPT = 60_000
 
 
 class DeviceHand:
-    """Moves one arm as its operator, with targets that follow the motion of an input device.
+    """Lets a person move an arm with an input device, and feel the force of the arm on it.
 
-    The process of a live operator creates the object and calls `run`.
+    The process of a live operator creates the object and calls `run`. It is an operator of the
+    arm: the motion of the device moves the target that the arm follows.
 
     Args:
         hand: Connection to the site that runs the arm, in the role of its operator.
@@ -109,10 +110,11 @@ class DeviceHand:
         self._sent.clear()
 
     def serve(self) -> None:
-        """Performs one period of the device: reads its motion and applies a force.
+        """Moves the target of the arm as the device moved, and renders the force of the arm.
 
-        The method reads the position of the device, sends the site of the arm a new target, and
-        lets the device apply a force to the person. It takes one period of the device.
+        The method is called repeatedly. Each call takes one period of the device: it reads the
+        position, sends the new target to the site of the arm, and lets the device apply a force
+        to the person.
 
         Raises:
             OSError: The device is silent, or its connection is lost.

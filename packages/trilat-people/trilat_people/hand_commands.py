@@ -1,4 +1,9 @@
-"""Commands of the hands that move an arm: a program or a device, and the hand of a person."""
+"""The commands `trilat hand` and `trilat identify hand`, about those who operate an arm.
+
+`trilat hand` connects an operator to an arm of a session. The operator is a program of the
+user, or a person with an input device such as a SpaceMouse. `trilat identify hand` estimates
+from a log how stiff, damped and heavy the hand was with which a person held an arm.
+"""
 
 from typing import Annotated
 

@@ -1,9 +1,8 @@
 """Identifies mass, damping and stiffness of a person's hand from the log of a run.
 
-A person holds the arm of a site, a process that runs one arm and its control loop. At any site,
-a simulated operator of the kind `multisine` moves the arms with a sum of sines. The force F of
-the hand on the arm and the position X of the end effector contain responses to the sines. At
-the angular frequency w of each sine, these responses satisfy
+While the person holds an arm, a simulated operator of the kind `multisine` shakes the arms with
+a sum of sines. The force F of the hand on the arm and the position X of the end effector
+contain responses to the sines. At the angular frequency w of each sine, these responses satisfy
 
     F(j w) = -(M (j w)^2 + B j w + K) X(j w)
 

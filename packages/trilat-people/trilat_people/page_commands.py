@@ -1,7 +1,7 @@
-"""Commands that show a running session to people: on a web page, or in the terminal.
+"""The commands `trilat live` and `trilat watch`, which show a running session to people.
 
-On the page, people also take part in the session: they lead arms, stop them, and change
-settings.
+`trilat live` shows a web page on which people also take part: they move arms, stop them, and
+change settings. `trilat watch` shows a session in the terminal, or on such a page.
 """
 
 from functools import partial

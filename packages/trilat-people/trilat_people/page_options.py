@@ -1,4 +1,8 @@
-"""The options of the commands that serve a page to browsers."""
+"""Command-line options on how a web page is served: address, port, encryption and browser.
+
+Several commands show a running session on a web page. They share these options, so that an
+option has the same name and meaning in all of them.
+"""
 
 from pathlib import Path
 from typing import Annotated, NamedTuple

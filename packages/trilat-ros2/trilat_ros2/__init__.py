@@ -1,5 +1,5 @@
-"""The bridge between a running session and ROS 2, and its command `trilat ros2`.
+"""Connects a running session with ROS 2 programs, by the command `trilat ros2`.
 
-The package belongs to trilat-net, and registers its command there by an entry point of its
-pyproject.toml.
+ROS programs can observe the arms, command them, and stop them. The package is a distribution of
+its own, which registers its command by an entry point of its pyproject.toml.
 """

@@ -1,4 +1,8 @@
-"""The command `trilat ros2`, which bridges a running session to ROS 2."""
+"""The command `trilat ros2`, which connects a running session with ROS 2 programs.
+
+The command parses its options, connects to both networks, and starts the bridge in
+`ros2_bridge`.
+"""
 
 from pathlib import Path
 from typing import Annotated

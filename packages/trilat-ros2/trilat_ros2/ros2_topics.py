@@ -34,7 +34,7 @@ LATCHED = QualityOfService(latched=True, depth=1)
 
 
 class BridgeEnds(NamedTuple):
-    """Connections of the bridge to its two ends: the ROS programs and the session.
+    """The two networks that the bridge connects: the one of ROS and the one of the session.
 
     Attributes:
         graph: Connection to the ROS programs.
@@ -51,7 +51,7 @@ class BridgeEnds(NamedTuple):
     table: TopicTable
 
     def topic(self, site: str, name: str) -> str:
-        """Returns the full name of a topic of a site.
+        """Returns the full name of a topic of a site, in the naming scheme that the user chose.
 
         Args:
             site: Name of the site.
@@ -61,7 +61,7 @@ class BridgeEnds(NamedTuple):
 
 
 class SiteTopics:
-    """Publishes the records and statistics of one site on its ROS topics.
+    """Publishes the state of one arm as ROS topics, each only while a program subscribes to it.
 
     Args:
         ends: Connections to ROS and to the session.

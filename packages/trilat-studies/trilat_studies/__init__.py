@@ -1,9 +1,9 @@
-"""Studies of many runs: trials, sweeps, tuning, benchmarks, and an environment for training.
+"""Compares many runs: parameter sweeps, tuning of gains, benchmarks, and training of policies.
 
-The package belongs to trilat-net, and registers its commands and functions there by the entry
-points of its pyproject.toml: `trilat sweep` and `trilat_net.sweep`, for example.
+The package adds commands such as `trilat sweep`, and functions such as `trilat_net.sweep`. It
+is a distribution of its own, which registers them by the entry points of its pyproject.toml.
 
 Invariant:
-    - A study is a function of its plan. The number of worker processes, and the order in which
-      they finish, do not change any result.
+    - The result of a study depends on its plan alone. The number of worker processes, and the
+      order in which they finish, have no influence.
 """

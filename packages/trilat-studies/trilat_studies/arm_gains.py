@@ -1,8 +1,9 @@
 """Finds the largest gains with which equal arms can follow each other over a delay.
 
-Two or three equal arms follow one another over links with a delay. Each joint has a stiffness
-K, a damping d of its velocity, and for some control laws a damping Kd of the velocity of its
-position error. One number k, in 1/s^2, determines all gains:
+The longer the delay, the smaller the gains with which the arms stay stable. `tune_arm` takes
+the model of an arm and a delay, and returns a stiffness K and dampings for each joint: d of the
+velocity, and for some control laws Kd of the velocity of the position error. One number k, in
+1/s^2, determines all of them:
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m,
 

@@ -1,4 +1,8 @@
-"""Makes Gymnasium environments for training a policy: one, or several that advance together."""
+"""Makes Gymnasium environments, in which a policy is trained to operate an arm.
+
+Gymnasium is a common interface of reinforcement learning. `make_env` returns one environment,
+or with `num_envs` several that are simulated together, which is faster.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, overload

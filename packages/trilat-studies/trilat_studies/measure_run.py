@@ -1,19 +1,16 @@
-"""Measures a run and compares the result with the expectations of its scenario.
+"""Measures a run, such as its largest error, and compares the results with the expected limits.
 
-The table [expect] of a scenario states what a run must achieve. This module computes the
-metrics that the table can limit, such as the largest error or the time until the sites agree,
-and compares them with the limits. The run is either simulated in virtual time or read from a
-log. A site is a process that runs one arm and its control loop; a record is the result of one
-tick of this loop.
+A scenario, the file that describes an experiment, may contain a table [expect] of what a run
+must achieve. For example, `peak_error_max_rad` limits the largest error. This module computes
+the metrics that the table can limit, from a simulation or from the log of a run.
 
 Invariant:
     - Each metric has one definition. Both a simulation and a log pass their records, batch by
       batch in the order of time, to the same running statistics (`SiteStats`).
     - A metric that a run cannot give is None, and never a guess.
-    - Memory is bounded. Only extrema, sums, the last second of the records, and the buckets
-      for the judgement of the end are kept.
+    - Memory is bounded, however long the run is. Only extrema, sums, the last second of the
+      records, and a summary of the motion are kept.
     - The division of a run into batches changes only the last bits of a mean.
-    - The outcome of an expectation states the value, the limit and the margin.
 """
 
 import math
@@ -67,10 +64,12 @@ _VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
 
 
 class RecordBatch(NamedTuple):
-    """Consecutive records of one site, as one array per quantity.
+    """Results of consecutive ticks of one arm, as one array per quantity.
 
-    K is the number of records, n the number of joints, m the number of coordinates that the
-    sites agree on, and P the number of peers, the other sites whose states this site receives.
+    Metrics are computed from such batches, because statistics of arrays are much faster than
+    those of single records. K is the number of records, n the number of joints, m the number of
+    coordinates that the sites agree on, and P the number of peers, the other sites whose states
+    this site receives.
 
     Attributes:
         t_ns: Nominal times, shape (K,), in ns.
@@ -94,7 +93,7 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records after a time.
+        """Returns the records later than a given time.
 
         Args:
             t_ns: The time, in ns. A record at exactly this time is not returned.
@@ -103,7 +102,7 @@ class RecordBatch(NamedTuple):
         return self._slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records within an interval of time.
+        """Returns the records from one time up to another.
 
         Args:
             from_ns: Start of the interval, in ns, which belongs to the interval.
@@ -147,7 +146,7 @@ class RecordBatch(NamedTuple):
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Concatenates consecutive batches of one site to a single batch.
+    """Joins consecutive batches of records of one site to a single batch.
 
     Args:
         batches: Batches in the order of time, at least one.
@@ -305,11 +304,11 @@ class _CompiledRun:
         return run.ran_s >= self._scenario.duration_s or run.diverged_s is not None
 
     def find_next_end(self) -> float:
-        """Returns the end of the next batch, in s."""
+        """Returns the time up to which the next batch is simulated, in s."""
         return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
 
     def pass_records(self) -> None:
-        """Passes the records since the last call to the receivers."""
+        """Passes the records since the last call to the receiver of each site."""
         no_columns = slice(0, 0)  # for vectors that the site does not have
         records_of_sites = self.run.pop_records()
         for name, site_records in zip(self._scenario.names, records_of_sites, strict=True):
@@ -329,7 +328,7 @@ class _CompiledRun:
 
 
 class WholeRun(NamedTuple):
-    """A simulated run with all of its records.
+    """A simulated run of which all records were kept in memory, for measures of the whole run.
 
     Attributes:
         records: Records of each site, by its name.
@@ -362,7 +361,10 @@ _RECORD_ROWS = 1 << BATCH_RECORDS.bit_length()
 def run_whole_together(
     scenarios: Sequence[Scenario],
 ) -> Iterator[tuple[int, WholeRun, str]]:
-    """Runs scenarios side by side where that is possible, and keeps all records in memory.
+    """Simulates several scenarios, as many as possible at once, and keeps all of their records.
+
+    Scenarios that differ in numbers only share the vector instructions of the processor. Each
+    run equals that of `run_whole` bit for bit.
 
     Args:
         scenarios: The scenarios.
@@ -416,7 +418,7 @@ def _join_run(
 
 
 class Range(NamedTuple):
-    """Smallest and largest value of a quantity during a window of time, to compare with limits.
+    """Smallest and largest value of a quantity in a part of the run, to compare with limits.
 
     A quantity with a single value, such as a mean, has this value as both ends.
     """
@@ -426,10 +428,10 @@ class Range(NamedTuple):
 
 
 class WindowStats:
-    """Running statistics of one site within a window of time.
+    """Statistics of one arm in a part of the run, for which the scenario states limits.
 
-    A scenario can state limits for parts of its run, each of which is a window in its table
-    [expect]. The statistics are updated batch by batch, so that no records need to be kept.
+    Such a part is called a window in the table [expect] of the scenario. The statistics are
+    updated batch by batch, so that no records need to be kept.
 
     Args:
         window: Period of the run, with the limits that apply to it.
@@ -709,7 +711,7 @@ class SiteStats:
         return ages
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second of the run.
+        """Returns the records of the last second of the run, for the metrics `end_...`.
 
         Args:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier

@@ -1,7 +1,8 @@
-"""Decides which positions an arm can reach with its end effector.
+"""Finds out whether the end effector of an arm can reach a position.
 
-For a planar arm with two links, the answer follows from the lengths of the links. For a chain
-of more joints, a pose within the joint limits is searched numerically.
+The tasks of a training environment use this to draw goals that can be reached. For a planar arm
+with two links, the answer follows from the lengths of the links. For a chain of more joints, a
+pose within the joint limits is searched numerically.
 
 Invariant:
     - A position that counts as reachable can be reached.
@@ -33,7 +34,10 @@ _LARGEST_STEP_RAD = 0.5
 
 
 def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
-    """Tells whether the end effector of an arm can reach a position.
+    """Returns True if a pose was found in which the end effector of an arm is at a position.
+
+    For an arm with two links, the lengths of the links decide. For a chain of more joints, a
+    pose within the joint limits is searched, and the search may miss one.
 
     Args:
         arm: Model of the arm.

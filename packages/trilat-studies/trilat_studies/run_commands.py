@@ -1,4 +1,8 @@
-"""Writes the overrides of a scenario as text, and the command that repeats a run of a study."""
+"""Composes the command with which a user can repeat one run of a study.
+
+A sweep or a trial reports, for example, "trilat sim paper --set link.delay_ms=200". The
+functions convert values to the texts KEY=VALUE of the option --set, and quote them for a shell.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any

@@ -1,8 +1,7 @@
-"""Commands that study several runs: tests, comparisons, tuning, benchmarks, hands.
+"""The commands `trilat test`, `compare`, `tune` and `bench`, which study several runs.
 
-A run is one execution of a scenario, which describes the arms, their control laws and the
-network. Such a command executes or reads many runs that differ in a law, a gain or a delay, and
-prints their results side by side.
+Such a command runs a scenario many times, with different seeds, control laws, gains or delays,
+or reads the logs of earlier runs. Then it prints the results side by side.
 
 Invariant:
     - The commands print measured numbers. They do not rank control laws, because which number

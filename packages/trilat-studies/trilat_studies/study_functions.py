@@ -1,4 +1,8 @@
-"""The functions of the Python interface that need many runs, as `trilat_net.sweep`.
+"""The Python functions for studies of many runs: `sweep`, `margin`, `tune` and `bench`.
+
+A user calls them as functions of trilat_net, for example `trilat_net.sweep("paper",
+{"link.delay_ms": [0, 100]})`. Each does what a command does: `trilat sweep`, `trilat sweep
+--margin`, `trilat compare --tune` or `trilat bench`.
 
 Invariant:
     - These functions only convert their arguments, and call the modules that do the work.

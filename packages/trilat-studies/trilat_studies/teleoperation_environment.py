@@ -1,20 +1,19 @@
 """A Gymnasium environment for training a policy that operates one arm over the network.
 
-A policy takes the place of one user of an experiment. In each step it observes what that user
-can observe of the local arm and of the peers, the other arms, whose states arrive with the
-delay of the network. Its action is a target for the arm, or a force on it. All sites, each of
-which runs one arm, are simulated in virtual time.
+The policy takes the place of one user of an experiment. In each step it observes what that user
+can observe: the state of the own arm, and the states of the other arms, which arrive with the
+delay of the network. Its action is a target for the arm, or a force on it. All arms are
+simulated, as fast as possible.
 
 Invariant:
-    - An episode is a run in virtual time, and a function of the scenario, the seed and the
-      actions. If the episode is saved as a log, this log can be verified bit for bit.
+    - An episode is a function of the scenario, the seed and the actions. If the episode is
+      saved as a log, this log can be verified bit for bit.
     - A step is a fixed number of ticks of the control loop. An action that is refused makes no
       step and changes nothing.
-    - Steps are possible only after a reset and until the end of the episode.
     - The observations, and the time at which an action takes effect, are the same as for a
       user-written operator (`OwnHand`). Therefore a trained policy can operate an arm in a live
-      session without changes. Only orientations differ: they are observed as six numbers,
-      which never jump (`expand_poses`).
+      session without changes. Only orientations differ: they are observed as six numbers, which
+      never jump (`expand_poses`).
 """
 
 import math
@@ -111,7 +110,7 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Judgement of a step by the task of the episode.
+    """Result of a step of an episode: its reward, and whether the task is done or has failed.
 
     Attributes:
         reward: Reward of the step.
@@ -278,7 +277,9 @@ class _ActedHand(HandPlayer):
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
-    """An environment in which a policy operates one arm; its arguments are those of `make_env`.
+    """A Gymnasium environment in which a policy operates one arm of a simulated session.
+
+    `make_env` creates this object and explains its arguments.
 
     Attributes:
         observation_names: With `flat`, the name of each number of an observation, as in
@@ -576,7 +577,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
-        """Returns whether the end effector of a site can reach a position.
+        """Returns True if the end effector of a site can reach a position.
+
+        Tasks that draw random goals use it.
 
         Args:
             q: Joint angles of each site, from which the search for a pose starts, in rad.
@@ -592,7 +595,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
-        """Returns observations in the form of the observation space.
+        """Returns observations as the policy gets them: a dictionary, or one array with `flat`.
 
         Args:
             parts: The parts of an observation by name, or those of several observations, which
@@ -751,7 +754,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def judge(self, scene: Scene) -> Judgement:
-        """Returns the judgement of a step by the task.
+        """Asks the task of the episode for the reward of a step, and whether it is done.
 
         Args:
             scene: State after the step.
@@ -766,22 +769,23 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     @property
     def run(self) -> FusedRun:
-        """The simulated run of the episode."""
+        """The simulated run of the episode, which a vector environment may advance."""
         return self._run
 
     @property
     def total_ticks(self) -> int:
-        """Number of ticks of an episode that ends by its duration."""
+        """Number of ticks (control periods) after which the duration of an episode is over."""
         return self._ticks
 
     @property
     def plants(self) -> Mapping[str, Any]:
-        """Users' programs that move arms, by site."""
+        """User-written models of arms, by the name of the site that they belong to."""
         return self._plants
 
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:
-        """Notes steps of the episode that a vector environment computed.
+        """Records the actions of an episode that a vector environment has simulated.
 
+        The environment can then save or draw the episode as if it had made the steps itself.
         The state of `run` must be that after these steps.
 
         Args:
@@ -820,7 +824,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return clipped
 
     def clip_actions(self, values: Array) -> tuple[Array, Any]:
-        """Returns actions, clipped to their bounds, and which of them exceeded the bounds.
+        """Clips actions to their bounds, and reports which of them exceeded the bounds.
 
         Args:
             values: An action, or several actions, one per row, as the policy gave them.

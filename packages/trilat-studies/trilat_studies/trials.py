@@ -1,8 +1,8 @@
-"""Runs a scenario once per seed and checks whether it behaves as expected.
+"""Tests whether a scenario behaves as expected, with several random seeds.
 
 A scenario is the TOML file that describes an experiment. Its table [expect] states what a run
-must achieve, such as a largest error or a time until which the arms agree. A trial is a run of
-the scenario with one seed of the random numbers, whose metrics are compared with this table.
+must achieve, such as a largest error. A trial is a run of the scenario with one seed, whose
+measured values are compared with this table. The command is `trilat test`.
 
 From pytest, one test per seed:
 
@@ -17,17 +17,10 @@ From pytest, one test per seed:
 
 All seeds in one test, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
 
-The report for build servers is JUnit XML according to Jenkins' `junit-10.xsd`. It has a suite
-per scenario and a case per run. A case has one `failure` with all unmet expectations, or an
-`error` if the run has no result.
-
 Invariant:
     - One command repeats a trial, and the result of the trial contains that command.
-    - An evaluation is a pure function of metrics and expectations. It states the measured
-      value, the limit and the margin, whether or not the expectation is met.
-    - A live trial, which runs over a network, is evaluated from its log by the same code. In
-      addition its session must end in order, and its records must be the same bit for bit when
-      they are computed again.
+    - The evaluation of an expectation depends on the measured value and the limit alone. Its
+      result contains both, and the margin, whether or not the expectation is met.
     - Results are in the order of the trials, no matter which process ran them.
     - A trial that repeatedly kills its worker process affects no other trial.
 """
@@ -683,6 +676,10 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
     """Encodes the results of trials as a JUnit XML document, which build servers display.
+
+    The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
+    run. A case has one `failure` with all unmet expectations, or an `error` if the run has no
+    result.
 
     Args:
         report: The results.

@@ -1,14 +1,18 @@
-"""Several Gymnasium environments for training a policy, which advance side by side in lanes.
+"""Advances several Gymnasium environments together, in SIMD vector lanes of one core.
+
+Training a policy needs millions of steps. Processors compute the same operation on several
+numbers at once. Therefore environments that differ in numbers only are simulated side by side:
+each has its lane, a position in the vector registers. NumPy computes the observations and
+rewards of all environments together.
 
 Each sub-environment is a `TeleoperationEnv`, which begins its episodes and can draw and save
-them. The steps of all sub-environments are computed together: their simulated runs are in the
-lanes of vector registers, and observations, rewards and information are computed by NumPy.
+them.
 
 Invariant:
     - Observations, rewards and information are those of the sub-environments one by one, as
       `gymnasium.vector.SyncVectorEnv` returns them, bit for bit.
-    - Sub-environments whose present episode cannot be computed in lanes are stepped one by one,
-      and the reason is in `obstacle`.
+    - A sub-environment whose present episode cannot share the vector instructions is stepped by
+      itself. If no sub-environment can, the attribute `obstacle` has the reason.
     - If an action is refused, no sub-environment makes a step.
 """
 
@@ -40,7 +44,10 @@ Flags = NDArray[np.bool_]
 
 
 class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
-    """Several environments in which a policy operates one arm; see `make_env`.
+    """Several environments in which a policy operates one arm, simulated together for speed.
+
+    `make_env(..., num_envs=8)` creates this object. It has the interface of Gymnasium's vector
+    environments: `step` takes one action per environment, and returns one observation each.
 
     Args:
         env: The first sub-environment. The others are copies of it.
@@ -90,7 +97,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins episodes, of all environments or of those that `options["reset_mask"]` names.
+        """Begins new episodes, of all environments or of those in `options["reset_mask"]`.
 
         Args:
             seed: Seed of the random numbers of the first environment, to which each further
@@ -242,23 +249,30 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return self._join(batch, observations), infos
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Calls a method of each environment, or reads an attribute."""
+        """Calls a method of each environment, or reads an attribute of each, by its name.
+
+        The states of the episodes are written into the environments before, because an
+        environment does not take part in the joint simulation itself.
+        """
         self._write_back()
         return super().call(name, *args, **kwargs)
 
     def render(self) -> tuple[Any, ...]:
-        """Returns the pictures of all environments."""
+        """Returns a picture of the arms of each environment."""
         self._write_back()
         return super().render()
 
     def _write_back(self) -> None:
-        """Writes the state of the episodes in lanes into the sub-environments."""
+        """Copies the states of jointly simulated episodes into their environments."""
         for part in self._parts:
             part.write_back()
 
 
 class _Results:
-    """Results of a step, which the parts of a vector environment write.
+    """Results of one step of all environments, as Gymnasium's vector environments return them.
+
+    At most 64 environments are simulated together. Larger numbers are divided into parts, each
+    of which writes its results into this object.
 
     Args:
         count: Number of environments.
@@ -274,7 +288,10 @@ class _Results:
         self.infos: dict[str, Any] = {}
 
     def put_info(self, infos: dict[str, Any], key: str, where: Any, values: Any) -> None:
-        """Writes one entry of the information dictionary, with its mask.
+        """Writes one entry of the information dictionary of all environments.
+
+        Gymnasium stores next to each entry, under its key with a leading "_", an array of
+        booleans: True for the environments that have the entry.
 
         Args:
             infos: The dictionary, or a dictionary in it.
@@ -294,7 +311,7 @@ class _Results:
         infos[key][where] = values
 
     def put_observations(self, where: Any, observations: Any, is_all: bool) -> None:
-        """Writes observations.
+        """Writes the observations of some environments into those of all environments.
 
         Args:
             where: Their environments, an index of arrays.
@@ -319,7 +336,7 @@ class _Results:
 
 
 class _LaneEnvs:
-    """Some environments whose episodes advance in lanes.
+    """Environments that are simulated together, each in one lane of the vector registers.
 
     Args:
         envs: The environments, at most `LaneEpisodes.most_runs`.
@@ -361,7 +378,7 @@ class _LaneEnvs:
         self._goals: Array = np.zeros((count, *np.shape(env.task.goal)))
 
     def load(self, is_stepped: Flags) -> None:
-        """Puts episodes into the lanes that have begun since the last step.
+        """Puts new episodes, begun since the last step, into the lanes of their environments.
 
         Args:
             is_stepped: True for environments of the vector environment that are to be stepped.
@@ -419,7 +436,7 @@ class _LaneEnvs:
     def step(
         self, actions: Array, exceeds: Flags, is_stepped: Flags, results: _Results
     ) -> None:
-        """Advances the environments in lanes by one step.
+        """Advances the environments by one step, and writes their results into `results`.
 
         Args:
             actions: Checked actions of all environments of the vector environment.
@@ -558,7 +575,7 @@ class _LaneEnvs:
         }
 
     def write_back(self) -> None:
-        """Writes the state of the episodes in progress into the environments."""
+        """Copies the states of the episodes in progress into the environments."""
         for lane, env in enumerate(self._envs):
             is_here = self._is_loaded[lane] and self._runs[lane] is env.run
             if is_here and env.is_running and self._steps[lane]:
@@ -580,7 +597,7 @@ class _LaneEnvs:
 
     @property
     def envs(self) -> list[TeleoperationEnv]:
-        """The environments."""
+        """The environments, one per lane."""
         return self._envs
 
     @property
@@ -600,17 +617,17 @@ class _LaneEnvs:
 
     @property
     def k(self) -> NDArray[np.int64]:
-        """Number of ticks of each episode."""
+        """Number of ticks that each episode has lasted so far."""
         return self._steps * self._period
 
     @property
     def rate_hz(self) -> int:
-        """Tick rate, Hz."""
+        """Tick rate of the user's site, in Hz."""
         return self._rate_hz
 
 
 class _State:
-    """State of all episodes in lanes after a step.
+    """State of all jointly simulated episodes after a step, from which results are computed.
 
     Args:
         envs: The environments.
@@ -663,7 +680,7 @@ class _State:
         return self._view
 
     def observe(self, goals: Array) -> dict[str, Array]:
-        """Returns the parts of the observations, see `TeleoperationEnv`.
+        """Computes the observations of all episodes, by the names that `TeleoperationEnv` uses.
 
         Args:
             goals: Goals of the tasks.
@@ -672,7 +689,10 @@ class _State:
         return {name: parts[name] for name in sorted(parts)}
 
     def build_scene(self, lane: int) -> Scene:
-        """Returns the state of one episode for its task.
+        """Returns the state of one episode in the form that its task accepts.
+
+        A user's task is written for a single environment. Therefore it judges one episode at a
+        time.
 
         Args:
             lane: The lane.
@@ -724,7 +744,7 @@ class _State:
 
 
 class _ReachTasks:
-    """The tasks `ReachTask` of episodes in lanes, judged together.
+    """Tasks of the class `ReachTask` in several episodes, whose rewards are computed together.
 
     Args:
         count: Number of lanes.
@@ -739,7 +759,7 @@ class _ReachTasks:
         self._last_s = np.zeros(count)
 
     def load(self, lane: int, task: ReachTask, site: int) -> None:
-        """Takes over the state of a task.
+        """Copies the state of one task, such as its goal, into the arrays of all tasks.
 
         Args:
             lane: Lane of the episode.
@@ -754,12 +774,12 @@ class _ReachTasks:
         self._last_s[lane] = task.last_s
 
     def write_back(self, lane: int, task: ReachTask) -> None:
-        """Writes the state of a task into it."""
+        """Copies the state of one task from the arrays of all tasks back into the task."""
         task.reached_s = float(self._reached_s[lane])
         task.last_s = float(self._last_s[lane])
 
     def judge(self, state: _State, is_judged: Flags) -> tuple[Array, Flags]:
-        """Returns rewards, and which tasks are done, with the equations of `ReachTask.judge`.
+        """Computes the rewards of a step, and which tasks are done, as `ReachTask.judge` does.
 
         Args:
             state: State after the step.
@@ -811,7 +831,7 @@ def _find_hand_row(env: TeleoperationEnv) -> int:
 
 
 def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
-    """Explains why the present episode of an environment cannot be computed in lanes.
+    """Explains why the present episode of an environment cannot be simulated with others.
 
     Args:
         env: The environment.

@@ -1,9 +1,9 @@
 """Defines the command-line options that several commands share.
 
-The options select a scenario, a network connection or a log. Options that belong together are
-fields of a named tuple, for instance `Reach`, which describes how a command reaches a session.
-A command that has a parameter of such a type accepts all options of the type
-(`expand_option_tuples`). The methods of the tuple then open the connection or read the file.
+They select a scenario, a network connection or a log. Options that belong together are fields
+of a named tuple. For example, the fields of `Reach` say how a command reaches a session. A
+command that has a parameter of this type accepts all of its options (`expand_option_tuples`),
+and the methods of the tuple then open the connection or read the file.
 """
 
 import inspect
@@ -67,7 +67,7 @@ def check_range(
 
 
 def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
-    """Declares an option that takes a value.
+    """Declares a command-line option that takes a value, as in `--rate 100`.
 
     Args:
         names: Names of the option, separated by spaces, as in "-o --out".
@@ -79,7 +79,7 @@ def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
 
 
 def flag(names: str, text: str = "", **settings: Any) -> Any:
-    """Declares an option without a value.
+    """Declares a command-line option without a value, as in `--json`.
 
     Args:
         names: Names of the option, as in "--json" or "--ports/--no-ports".
@@ -744,11 +744,13 @@ class RunOptions(NamedTuple):
 
 
 def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes a command for Typer from a function whose parameters are groups of options.
+    """Makes a command from a function some of whose parameters are named tuples of options.
 
-    Typer, the command line library, makes one option of each parameter. A group is a named
-    tuple such as `Reach`, with one field per option. The returned function has one parameter
-    per field instead. When it is called, it puts the fields together again.
+    Several commands share options, such as those that name a network connection. These options
+    are the fields of one named tuple, such as `Reach`. Typer, the command line library, makes
+    one option of each parameter, and knows no tuples. Therefore the returned function has one
+    parameter per field. When it is called, it puts the fields into their tuples and calls the
+    original function.
 
     Args:
         run: Function that executes the command, with groups of options as parameters.
@@ -772,7 +774,7 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(run)
     def run_with_tuples(**arguments: Any) -> Any:
-        """Executes the command, after it has put the options into their groups again.
+        """Calls the function of the command, after the options have been put into their tuples.
 
         Args:
             **arguments: Value of each option, by the name of its parameter.

@@ -1,4 +1,8 @@
-"""What commands of many runs share: progress on the terminal, and runs that take place live."""
+"""Shows the progress of commands with many runs, and runs a scenario live for such a command.
+
+A sweep or a tuning may take hours. `show_progress` shows a bar in a terminal. In a file or a
+pipe it prints at most ten lines with the remaining time.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,1 +1,5 @@
-"""Play a log on the network again, in a new session: the same bytes at the same times."""
+"""Plays a log: publishes its messages on the network again, at their original times.
+
+Recorders and viewers can thus be tested, or shown a session, without the arms. `play_process`
+is the process that plays, `session_reader` reads the log, and `player` keeps the times.
+"""

@@ -1,16 +1,15 @@
-"""Stores messages compactly, and sorts them into the order in which they are played.
+"""Sorts the messages of a log into the order of playing, and stores them compactly.
 
-A log is played by publishing its messages again, at the times of the original session. Each
-message belongs to a channel, and the messages of a channel are numbered. A `BatchBuilder`
-collects messages in the order of a file and sorts them into a `MessageBatch`, a table of
-numbers with a buffer of bytes. A minute of 9000 messages/s takes some 100 MiB in this form, a
-third of its size as Python objects.
+A recorder writes messages as they arrive, so that a message that it missed at first comes late
+in the file. Played messages must be in order. A `BatchBuilder` collects messages in the order
+of a file and sorts them into a `MessageBatch`, a table of numbers with a buffer of bytes. A
+minute of 9000 messages/s takes some 100 MiB in this form, a third of its size as Python
+objects.
 
 Invariant:
     - Messages are played in the order of their times, and within a channel in the order of
       their numbers.
-    - A site sends a message again if the recorder missed it. In the file, such a message comes
-      after messages with higher numbers. It is played no later than the next message of its
+    - A message that a site has sent again is played no later than the next message of its
       channel.
     - Messages with the same time keep the order of the file.
 """
@@ -234,7 +233,7 @@ class BatchBuilder:
 
     @property
     def memory(self) -> int:
-        """Memory of all messages, in bytes."""
+        """Memory that the messages added so far need, in bytes."""
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:

@@ -1,8 +1,8 @@
-"""Supplies the player of a log with messages in the order in which they are played.
+"""Supplies the player of a log with messages, so that it never waits for the disk.
 
 To play a log means to publish its messages again, at the times of the original session. A short
 log is loaded into memory before. A long log is read by a second process, the reader. It reads
-ahead and sends the messages through a pipe, so that the player never waits for the disk.
+ahead and sends the messages through a pipe, in the order in which they are played.
 
 Invariant:
     - The method that returns the next messages never waits. If none are available yet, it says

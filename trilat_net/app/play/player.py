@@ -1,10 +1,10 @@
-"""Plays messages: publishes each message once, in order, at its deadline.
+"""Publishes the messages of a recorded session in order, each one at its time.
 
-The deadline of a message follows from its time in the log by a linear function, which contains
-the start time and the speed of playing. The player sleeps until shortly before a deadline and
-then polls the clock. It does other work (replies to other programs, reading in advance,
-progress) in the time that is left between deadlines. If no time is left, it does some of this
-work a hundred times a second nevertheless.
+The time at which a message is due, its deadline, follows from its time in the log by a linear
+function, which contains the start time and the speed of playing. The player sleeps until
+shortly before a deadline and then polls the clock. It does other work (replies to other
+programs, reading in advance, progress) in the time that is left between deadlines. If no time
+is left, it does some of this work a hundred times a second nevertheless.
 
 Invariant:
     - The deadlines depend only on the times in the log and on one start time, so that a late
@@ -39,7 +39,9 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Converts times in the log to deadlines on the clock, by a linear function.
+    """Converts times in a log to the times on the clock at which messages are published.
+
+    The conversion is a linear function of the start time and the speed of playing.
 
     Attributes:
         origin_ns: Deadline of the time `start_ns` on the clock, in ns.
@@ -104,7 +106,7 @@ def parse_rate(text: str) -> float:
 
 
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
-    """Waits until a deadline.
+    """Waits until a deadline: sleeps at first, and polls the clock shortly before the deadline.
 
     Args:
         clock: The clock.

@@ -1,8 +1,8 @@
-"""Reads the messages of a log that will be played, selected by channel and time.
+"""Reads from a log the messages that will be played, selected by channel and time.
 
-A log contains the messages of a session, a joint run of several sites, each of which controls
-one arm. To play it means to publish its messages again, at the times of the original session.
-Each start of a site has a random number, the boot, by which its messages are identified.
+To play a log means to publish its messages on the network again, at the times of the original
+session. A session is a joint run of several sites, each of which controls one arm. Each start
+of a site has a random number, the boot, by which its messages are identified.
 
 Invariant:
     - Payloads are passed on unchanged. Only the number of an event and the boot are decoded.

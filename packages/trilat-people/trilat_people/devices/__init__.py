@@ -1,7 +1,8 @@
-"""Devices that a person holds to move an arm, one in each file.
+"""Drivers of the input devices that a person holds to move an arm, one file for each device.
 
-Each file has a class with the interface `Device`. `open_device` finds the class by the name of
-the file, so that a further device needs no entry in any list.
+For example, `trilat hand m1 --device spacemouse` opens the class in the file spacemouse.py. A
+driver is a class with the interface `Device`. `open_device` finds it by the name of its file,
+so that a new driver needs a new file and no other change.
 """
 
 from importlib import import_module

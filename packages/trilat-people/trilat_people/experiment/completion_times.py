@@ -62,7 +62,7 @@ class CompletionTime(NamedTuple):
 
 
 class CompletionComparison(NamedTuple):
-    """Comparison of the completion times of two conditions, within units.
+    """Comparison of the completion times under two conditions, by a sign test.
 
     Attributes:
         first: Name of the first condition.
@@ -118,9 +118,10 @@ def find_median(times_s: Sequence[float]) -> float:
 def find_unit_medians(
     rows: Sequence[Row], unit: str = "participant"
 ) -> dict[str, dict[str, float]]:
-    """Returns the median completion time of each condition and unit, in s.
+    """Returns the median completion time of each unit under each condition, in s.
 
-    A median that was not reached is infinite.
+    A unit is a participant, or a pair whose members take part together. A median is infinite if
+    half or more of the trials were not completed in time.
 
     Args:
         rows: Trials with `completion_s` and `succeeded`, as in `trials.csv`.
@@ -299,7 +300,7 @@ def _replace_infinity(time_s: float) -> float | None:
 def to_table(
     results: Sequence[CompletionTime] | Sequence[CompletionComparison],
 ) -> list[dict[str, Any]]:
-    """Converts results to rows of plain values for CSV and JSON.
+    """Converts completion times, or their comparisons, to table rows for CSV and JSON.
 
     Args:
         results: Completion times of conditions, or their comparisons.

@@ -1,17 +1,15 @@
-"""Analyses an experiment with people: means, comparisons and figures.
+"""Analyses an experiment with people: means, comparisons of the conditions, and figures.
 
-`analyse_experiment` reads the journals of an experiment's folder and writes tables, figures and
-a report into the folder. `compute_experiment_power` plans the number of participants.
+`analyse_experiment` reads the results that were stored during the experiment, and writes
+tables, figures and a report into the folder of the experiment. `compute_experiment_power` is
+called before an experiment, to plan the number of participants.
 
 Invariant:
-    - The analysis follows from the journals alone.
+    - The analysis follows from the stored results alone.
     - Practice and catch trials do not count.
     - A trial that was not completed counts. Its completion time is censored: it is longer than
       that of any completed trial (see `completion_times`).
-    - Every measure that trials have is summarised, also if all its values are equal. If numbers
-      of a measure are missing, their number is stated.
     - Every number in a figure or a sentence is also in a table.
-    - The facts of the study name the analyses that were computed, and no others.
 """
 
 import json
@@ -129,7 +127,9 @@ class ExperimentAnalysis(Result):
     """The statistics of an experiment: comparisons of its conditions, and facts of the study.
 
     Creating this object computes everything except the figures, which `write` draws. A unit is
-    a participant or a pair, whichever is sampled independently.
+    a participant or a pair, whichever is sampled independently. Every measure that trials have
+    is summarised, also if all its values are equal. If numbers of a measure are missing, their
+    number is stated.
 
     Args:
         experiment: The experiment in its folder.

@@ -95,7 +95,7 @@ class _ExperimentStatus(NamedTuple):
 
 
 class Experiment(Result):
-    """An experiment in its folder, which contains its plan, journals, logs and tables.
+    """An experiment in its folder: the plan, the trials that were run, and their results.
 
     `begin_experiment` and `open_experiment` create this object.
 

@@ -101,7 +101,7 @@ def average_trials(
 
 
 def read_number(value: Any, measure: str, row: Row) -> float:
-    """Returns the value of a measure in a row as a number.
+    """Converts the value of a measure in a table to a number, and refuses any other text.
 
     Args:
         value: A number, or its text from a CSV file.
@@ -386,7 +386,7 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 
 
 class MixedEffect(NamedTuple):
-    """Effect of a condition relative to the first condition.
+    """Effect of a condition in a mixed model, relative to the first condition.
 
     Args:
         condition: Name of the condition.

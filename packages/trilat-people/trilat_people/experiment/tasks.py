@@ -185,7 +185,7 @@ class TrialGoal:
         position_m: Array,  # noqa: ARG002
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes the measures that only this task has.
+        """Computes measures of this task only, such as the mean force against a wall.
 
         Args:
             after_s: Times since the target's appearance, shape (K,), in s.
@@ -218,7 +218,9 @@ class TrialGoal:
 
 
 class Outcome(NamedTuple):
-    """How a trial ended. A trial without an outcome is still running.
+    """How a trial ended: whether the task was done, and when.
+
+    A trial without an outcome is still running.
 
     Attributes:
         succeeded: True if the task was done. False after the time limit or a broken rule.

@@ -1,10 +1,9 @@
-"""Runs an experiment with people: a live session per trial, on one set of browser pages.
+"""Conducts an experiment with people: one live session per trial, on the same browser pages.
 
-A session is a run in which several processes each control one robot arm, and a trial is one
-execution of a task. The participants open their pages once. For each trial of the protocol this
-module starts a session, shows it on the pages of the experimenter and the participants, checks
-the recorded log, and writes the result to the journal of the experiment. Between trials it
-collects consents and questionnaires.
+The participants open their pages once. For each trial, one execution of a task, this module
+starts a session, shows it on the pages of the experimenter and the participants, checks the
+recorded log, and writes the result to the journal of the experiment. Between trials it collects
+consents and questionnaires.
 
 Invariant:
     - A trial counts only if its log exists and is valid. The log is moved to its final place

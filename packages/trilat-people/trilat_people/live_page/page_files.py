@@ -1,7 +1,7 @@
-"""Selects the files that the page's server sends: the page, and the results of a session.
+"""Selects the files that the server of the web page sends: the page and the results.
 
-The page shows a session, in which several processes each control one robot arm, in a browser.
-The results are the log of the session and the report that is computed from it.
+The results are the log of the session and the report that is computed from it. They are offered
+for download on the page when the session has ended.
 
 Invariant:
     - A page runs scripts of its own server only. A report runs its own scripts, isolated from

@@ -1,26 +1,21 @@
-"""Defines the requests of the web pages of a session, and passes them to the robot arms.
+"""Defines the requests that a web page may send, and passes them to the robot arms.
 
-A session is a run in which several processes, called sites, each control one robot arm. People
-watch and control it on web pages. The role of a person is experimenter, user of one arm, or
-watcher.
-
-The server of the pages reads each message of a page with `read_page_message`, and checks with
-`Role.may` that the role permits it. `PageHands` then moves the arms that the person holds.
-`OrderDesk` sends other requests to the sites and receives their replies. A site may refuse a
-request.
+People watch and control a running session on web pages. The role of a person is experimenter,
+user of one arm, or watcher. The server of the pages reads each message of a page with
+`read_page_message`, and checks with `Role.may` that the role permits it. `PageHands` then moves
+the arms that the person holds. `OrderDesk` sends other requests to the sites, the processes
+that each control one arm, and receives their replies.
 
 Invariant:
     - A valid message has one of the types below, finite numbers in range, and names that the
-      session contains. A type of message may not arrive more often than its rate allows. Any
-      other message is counted and dropped.
+      session contains. Any other message, and any that exceeds the rate of its type, is counted
+      and dropped.
     - Of several requests that wait and change the same network link, only the newest is sent.
       The same holds for the weights with which a site follows the other arms.
     - Only one request at a time waits for the reply of a site. A request to stop the arm does
-      not wait for this, but is sent at once.
+      not wait for this, but is sent at once. Every role may send it.
     - The address of a page contains a secret token, which grants a role and, to a user, a site.
-      The rest of the address may lower the role, but never raise it. A token is needed on this
-      machine too, because other users of the machine can connect.
-    - Every role may stop the arms.
+      The rest of the address may lower the role, but never raise it.
 """
 
 import hmac
@@ -80,7 +75,7 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """Message of a page that it has drawn a frame and can receive another one.
+    """Message of a page that it has drawn the last frame, so that the next one can be sent.
 
     A frame is a message of the server that describes the present state of the session.
 
@@ -330,7 +325,7 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """States who uses a page: which rights the user has, and which arms the page shows.
+    """The rights of the person at a page, and the arm whose user's view the page shows.
 
     Attributes:
         kind: An experimenter may do everything, a user may hold the arm of one site, and a
@@ -388,7 +383,8 @@ class Role:
 class RoleLinks:
     """Makes the links that open a page, and finds out which role a link grants.
 
-    A link contains a secret token, so that only those who received it can open the page. The
+    A link contains a secret token, so that only those who received it can open the page. A
+    token is needed on this machine too, because other users of the machine can connect. The
     token of a role is computed from a random secret, so that it need not be stored.
     """
 
@@ -460,9 +456,10 @@ class RoleLinks:
 
 
 class PageHands:
-    """Holds and moves arms on behalf of one page.
+    """Moves the arms that the person at one page holds.
 
-    The page's own messages serve as heartbeat: if they stop, the site releases the arm.
+    The messages of the page serve as heartbeat: if they stop, for example because the page was
+    closed, the site releases the arm.
 
     Args:
         bus: Network connection that reaches the session.
@@ -545,7 +542,10 @@ class _OpenQuery(NamedTuple):
 
 
 class OrderDesk:
-    """Sends the orders of all pages to the sites, and collects the replies of the sites.
+    """Sends the requests of all pages to the sites, one at a time, and collects their replies.
+
+    A site is a process that controls one arm. A request changes, for example, the delay of a
+    link.
 
     Args:
         bus: Network connection that reaches the session.

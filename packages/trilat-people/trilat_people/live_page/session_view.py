@@ -105,7 +105,9 @@ class Tail(Generic[T]):
 
 
 class SiteView:
-    """What the observer knows about one site: its newest messages, and which are missing.
+    """What an observer knows about one arm: its newest state, and which messages are missing.
+
+    The messages come from the process of the arm, its site.
 
     Args:
         bus: Network connection that reaches the session.

@@ -1,8 +1,8 @@
-"""The benchmark suite: compares control laws in the same tasks, over the same links.
+"""The benchmark suite: compares control laws in the same tasks, over the same network links.
 
-Every law is run with the same random seeds, and one procedure tunes the gains of all laws. A
-plan (`plan_bench`) selects the runs, `run_bench` executes them in a folder, and `BenchResults`
-has their tables.
+All laws run with the same random seeds, and one procedure tunes their gains, so that no law has
+an advantage. `plan_bench` selects the runs, `run_bench` executes them and stores them in a
+folder, and `BenchResults` makes tables of them.
 """
 
 from .bench_plan import BenchPlan, plan_bench

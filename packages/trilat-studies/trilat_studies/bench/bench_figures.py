@@ -1,14 +1,14 @@
-"""Draws the results of the benchmark suite as coloured tables.
+"""Draws the results of the benchmark as coloured tables: control laws against network links.
 
-A figure has a panel per task. In a panel, a row is a control law, a column is a link (a
-connection with a certain delay and loss), and the colour of a cell is the mean of a quantity
+A figure has a panel per task. In a panel, a row is a control law, a column is a link with a
+certain delay and loss, and the colour of a field is the mean of a quantity, such as the error,
 over the runs of that law over that link. The figure "stable" shows the worst judgement of these
 runs instead.
 
 Invariant:
-    - The colour of a cell depends only on its mean, or on its judgement.
-    - In a figure of means, a white cross marks a cell with a run that is not stable. A white
-      dot marks a cell without such a run, but with a run whose stability is open.
+    - The colour of a field depends only on its mean, or on its judgement.
+    - In a figure of means, a white cross marks a field with a run that is not stable. A white
+      dot marks a field without such a run, but with a run whose stability is open.
     - Equal results give equal bytes.
 """
 

@@ -1,16 +1,12 @@
 """Plans the benchmark of control laws: which law runs in which task, over which link.
 
-The benchmark consists of cells. A cell is one control law in one task over one link (the delay
-and loss between the arms). It runs once per random seed. A task and a link are sets of
-overrides of a scenario that is shipped with the program, so `trilat sim` can reproduce every
-run.
+A task and a link (the delay and loss between the arms) are sets of overrides of a scenario that
+is shipped with the program, so `trilat sim` can reproduce every run. One law in one task over
+one link is called a cell. It runs once per random seed.
 
-One procedure, `trilat bench --tune`, tunes the gains of all laws and stores them in a file. It
-selects the gains with the smallest error among the choices that also stay stable if all delays
-grow by the factor `TUNING_MARGIN`. A study is a named selection of tasks, laws and links.
-
-The tuning of each law at each round trip is stored as soon as it has finished, so that an
-interrupted tuning continues.
+The gains of all laws are tuned by one procedure, `trilat bench --tune`, which stores them in a
+file. It selects the gains with the smallest error among those that also stay stable if all
+delays grow by the factor `TUNING_MARGIN`.
 
 Invariant:
     - Gains are never set by hand. They come from `trilat bench --tune` only.
@@ -376,7 +372,7 @@ Without it, a law that comes to rest slowly would appear to be unstable.
 
 
 class TunedGains(msgspec.Struct, frozen=True):
-    """The gains of a law in a form of the suite, tuned at one round trip.
+    """Gains of a control law, tuned for one kind of scenario and one round trip of the network.
 
     The procedure tries `tried` candidates. Of those that come to rest at the pose of the task,
     and still do so when delays grow by `TUNING_MARGIN`, it selects the candidate with the
@@ -421,7 +417,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Converts overrides to strings KEY=VALUE, in the form that the command line accepts.
+    """Converts overrides of a scenario to texts KEY=VALUE, as the command line accepts them.
 
     Args:
         settings: Values by key of the scenario.
@@ -777,10 +773,7 @@ class BenchPlan(NamedTuple):
 
     @property
     def links(self) -> list[str]:
-        """Names of the links over which the benchmark runs, each once, in running order.
-
-        These are also the columns of its figures.
-        """
+        """Names of the network links of the benchmark, in the order of its figures."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
@@ -792,7 +785,7 @@ class BenchPlan(NamedTuple):
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns the cell with a name.
+        """Returns the part of the plan for one law in one task over one link, by its name.
 
         Args:
             name: Name of the cell, as in "contact/wave/rtt272": task, law and link.
@@ -902,7 +895,7 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Returns why the benchmark has no run of a control law in a task, as the tables print it.
+    """Explains why the benchmark has no run of a control law in a task, for the tables.
 
     Args:
         law: Name of the control law.

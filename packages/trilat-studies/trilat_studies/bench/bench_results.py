@@ -1,16 +1,16 @@
 """Summarises the results of the benchmark as tables, Markdown, CSV and JSON.
 
-The benchmark runs control laws in tasks over links with different delays and losses. A cell is
-one law in one task over one link, and has one run per random seed. For each law, the tables
-show over how many links the law is stable, which properties its runs have, and the means of the
-measured quantities.
+The benchmark runs control laws in several tasks, over network links with different delays and
+losses, with several random seeds. For each law, the tables show over how many links the law is
+stable, which properties its runs have, and the means of the measured quantities. One law in one
+task over one link is called a cell.
 
 Invariant:
     - The output depends on the runs alone. It contains no time of day, so equal results give
       equal bytes.
     - A mean or share over at least `LEAST_SEEDS` seeds has its 95 % confidence interval.
     - Every run that is not stable is visible in the tables.
-    - Laws are not ranked.
+    - Laws are not ranked, because which quantity matters depends on the use.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,7 +44,7 @@ LEAST_SEEDS = 20
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns the name of a cell's runs in the journal of finished runs.
+    """Returns the name under which the journal of finished runs stores the runs of a cell.
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
@@ -195,9 +195,7 @@ _JUDGEMENTS = (
 
 
 class BenchCellResult(NamedTuple):
-    """Results of a cell of the suite: a control law in a task over a link.
-
-    A cell has one run for each of its seeds.
+    """Results of one control law in one task over one network link, a run for each random seed.
 
     Attributes:
         cell: The law, task, link and gains of the runs.
@@ -209,7 +207,7 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of runs of the cell that are judged stable.
+        """Number of runs that are judged stable.
 
         Runs that only came to rest do not count.
         """
@@ -297,10 +295,10 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """The results of a suite, or of a part of it, as tables and as text.
+    """The results of the benchmark or of a part of it, to be printed, written and searched.
 
-    The suite runs control laws in several tasks over several links. A cell is a law in a task
-    over a link, and has one run per seed.
+    The benchmark runs control laws in several tasks over several links. `places` has one result
+    per cell: a law in a task over a link.
 
     Attributes:
         plan: Plan of the suite.
@@ -366,7 +364,7 @@ class BenchResults(Result):
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
-        """Yields the results of a task: one for each control law and link that ran in it.
+        """Yields the results of a task, optionally those of one control law or one link only.
 
         Args:
             task: Name of the task, such as "contact".
@@ -379,7 +377,7 @@ class BenchResults(Result):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of one cell of the suite.
+        """Returns the result of one law in one task over one link.
 
         Args:
             task: Name of the task.
@@ -456,7 +454,9 @@ def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
 
 
 def name_law(law: str, form: str) -> str:
-    """Returns the name of a control law for tables, with a note if only two arms take part.
+    """Returns the name of a control law for tables, as in "wave (two sites)".
+
+    The note shows that only two arms take part.
 
     Args:
         law: Name of the control law.

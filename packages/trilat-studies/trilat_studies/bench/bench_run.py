@@ -1,12 +1,14 @@
-"""Executes the runs of the benchmark suite: judges and measures each run, and stores it.
+"""Executes the runs of the benchmark suite, decides whether each is stable, and measures it.
 
-A run is judged as its stability certificate would judge it (`analysis.judge`): by its
-end, by the characteristic roots of its loop, and by its twins where they matter. A twin is a
-repetition of the run with a small disturbance, which shows whether disturbances grow.
-A run is made longer if its judgement needs more time: it then lasts for `TIME_CONSTANTS` of its
-slowest time constants. A run that is not stable is repeated over twice its length. Errors,
-efforts and forces are measured over the time of the task only, from the same records that
-`trilat sim` writes.
+`run_bench` is called with a plan of runs and a folder, in which finished runs are stored.
+Whether a run is stable is decided as by `trilat certify`: from the end of the run, from the
+characteristic roots of its control loop, and where these do not suffice, from repetitions of
+the run with a small push, which show whether disturbances grow.
+
+Some runs are too short for a decision. They are repeated with a duration of `TIME_CONSTANTS` of
+their slowest time constants. A run that is not stable is repeated over twice its length.
+Errors, efforts and forces are measured over the time of the task only, from the same records
+that `trilat sim` writes.
 
 Invariant:
     - The numbers of a run depend on its scenario alone. The number of processes, their order
@@ -108,7 +110,9 @@ It is half of the least force of the wall that counts as contact, so the slave k
 
 
 class BenchRunItem(NamedTuple):
-    """One run of the benchmark, as it is sent to a worker process. It can be pickled.
+    """Everything that a worker process needs to execute one run of the benchmark.
+
+    The object can be pickled, and is thus sent to the process.
 
     Attributes:
         cell: The task, control law and link of the run, with the tuned gains.
@@ -126,10 +130,10 @@ class BenchRunItem(NamedTuple):
 
 
 class JudgedRun(NamedTuple):
-    """A run of the suite with all of its records, and the judgement whether it is stable.
+    """A run of the benchmark with all of its records, and the decision whether it is stable.
 
-    The judgement takes twins into account where they matter: repeated runs with a small
-    disturbance, which show whether disturbances grow.
+    If the characteristic roots do not decide, twins do: repetitions of the run with a small
+    push, which show whether disturbances grow.
 
     Attributes:
         scenario: Scenario of the run. Its duration is that of the run.
@@ -207,7 +211,7 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
 
 
 def judge_bench_run(scenario: Scenario, length_s: float) -> JudgedRun:
-    """Executes a scenario, and judges the run as its certificate would.
+    """Simulates a scenario, and decides whether the run is stable as `trilat certify` would.
 
     Args:
         scenario: The scenario. Its own duration is ignored.

@@ -1,9 +1,10 @@
-"""Divides the cells of a sweep into groups whose runs differ in numbers only.
+"""Orders the runs of a sweep so that many of them can be simulated side by side.
 
-Runs that differ in numbers only, for example in a gain, can be computed side by side. An axis
-may also change the structure of the scenario: the control law, the joints of an arm, the sites
-or their tick rates. The cells are then run group by group, so that every worker gets runs of
-one structure.
+A sweep runs a scenario with many combinations of parameters, called cells. Runs that differ in
+numbers only, such as a gain or a delay, share the vector instructions of the processor. A
+parameter may also change the structure of the scenario: the control law, the joints of an arm,
+the sites or their tick rates. This module divides the cells into groups of one structure, which
+run one after the other.
 
 Invariant:
     - Every cell of the grid belongs to exactly one group.
@@ -26,7 +27,10 @@ LAW_KEY = "law"
 
 
 class CellGroups(NamedTuple):
-    """Groups of the cells of a sweep whose runs have the same structure.
+    """Divides the grid of a sweep into groups of runs that can be simulated side by side.
+
+    The runs of a group have the same structure: control laws, joints, sites and tick rates. For
+    example, a sweep over two control laws and 50 delays has two groups of 50 cells.
 
     Attributes:
         keys: Keys of the axes that change the structure.
@@ -39,12 +43,15 @@ class CellGroups(NamedTuple):
 
     @property
     def group_count(self) -> int:
-        """Number of groups: the product of the numbers of parts."""
+        """Number of groups: the product of the numbers of parts of all axes."""
         return prod(map(len, self.parts))
 
     @property
     def sentence(self) -> str:
-        """Sentence on the groups for the user. Empty if there is only one."""
+        """Sentence that tells the user which axes divide the sweep.
+
+        Empty if there is only one group.
+        """
         if not self.keys:
             return ""
         change = "changes" if len(self.keys) == 1 else "change"
@@ -55,7 +62,7 @@ class CellGroups(NamedTuple):
         )
 
     def iterate_cells(self, shape: Sequence[int]) -> Iterator[int]:
-        """Yields the numbers of all cells, group by group.
+        """Yields the numbers of all cells in the order in which they are run, group by group.
 
         Args:
             shape: Size of the grid.
@@ -69,10 +76,11 @@ class CellGroups(NamedTuple):
 
 
 def find_cell_groups(plan: SweepPlan) -> CellGroups:
-    """Finds the axes of a sweep that change the structure of the scenario.
+    """Groups the cells of a sweep by the structure of their scenarios.
 
-    Up to 32 values of each axis are compared, with the other axes at their first values. If
-    they differ and the axis has more values, each of its values is a group of its own.
+    Scenarios along each axis are compared, with the other axes at their first values. Up to 32
+    values of an axis are checked, since a grid may be large. If they differ and the axis has
+    more values, each of its values is a group of its own.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

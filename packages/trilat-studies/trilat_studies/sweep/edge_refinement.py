@@ -1,9 +1,9 @@
-"""Chooses the cells of a sweep that lie along the stability edge.
+"""Chooses the runs of a sweep that locate the edge between stable and unstable parameters.
 
-A sweep runs a scenario on a grid of parameters, and a cell is one point of this grid. The
-stability edge separates stable from unstable cells. A refined sweep first runs a coarse part of
-the grid. Then it halves the boxes that the edge crosses, again and again, until their corners
-are neighbours in the grid.
+A map of 201 by 201 parameter values needs 40 401 runs, most of which lie far from the edge. A
+refined sweep runs a coarse part of this grid. Then it halves the boxes that the edge crosses,
+again and again, until their corners are neighbours in the grid. A cell is one point of the
+grid.
 
 Invariant:
     - The chosen cells are a function of the plan and of the results. They do not depend on the
@@ -31,7 +31,9 @@ UNSTABLE, STABLE, UNDECIDED = range(3)
 
 
 def choose_side(*, stable: int, decided: int) -> int:
-    """Returns the side of the edge on which a cell lies.
+    """Returns whether a cell is stable, unstable or undecided, by the majority of its runs.
+
+    The result is one of the constants `STABLE`, `UNSTABLE` and `UNDECIDED`.
 
     Args:
         stable: Number of stable runs of the cell.
@@ -43,7 +45,10 @@ def choose_side(*, stable: int, decided: int) -> int:
 
 
 class EdgeRefinement:
-    """Cells of a refined sweep, in the order in which they are to be run.
+    """Chooses the cells of a sweep along the stability edge, in rounds of finer resolution.
+
+    The caller runs the cells that `find_next_cells` returns, and passes their results to its
+    next call, until no cells are returned.
 
     Args:
         plan: The sweep, whose `refine` is the number of halvings.
@@ -59,7 +64,7 @@ class EdgeRefinement:
         self._chosen = np.zeros(plan.cells, bool)
 
     def find_next_cells(self, sides: Mapping[int, int]) -> list[int]:
-        """Returns the cells that are to be run next.
+        """Stores the results of the last round, and returns the cells of the next round.
 
         Args:
             sides: Side of each cell that has run since the last call.
@@ -82,7 +87,7 @@ class EdgeRefinement:
         return []
 
     def list_coarse_cells(self) -> list[int]:
-        """Returns the numbers of the cells with which the sweep begins."""
+        """Returns the numbers of the cells of the coarse grid, with which the sweep begins."""
         wanted = np.zeros(self._shape, bool)
         for panel in self._iterate_panels():
             wanted[panel] = self._mark_lattice()
@@ -90,7 +95,10 @@ class EdgeRefinement:
         return numbers
 
     def count_most_cells(self) -> int:
-        """Estimates the number of cells, for an edge that crosses each panel once."""
+        """Estimates how many cells will run, if the edge crosses each panel of the map once.
+
+        The estimate serves to tell the user how long the sweep will take.
+        """
         panels = sum(1 for _ in self._iterate_panels())
         along_edge = 0
         for level in range(self._halvings):

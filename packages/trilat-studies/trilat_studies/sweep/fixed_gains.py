@@ -1,12 +1,12 @@
-"""Lists the gains of control laws that stay the same in all runs of a parameter sweep.
+"""Lists the gains that a parameter sweep did not vary, as a note for its figures.
 
-A sweep runs a scenario with many combinations of parameters. Its result is often shown as a
-stability map, which marks the combinations with which the arms are stable. These results also
-depend on the gains that the sweep did not vary, so reports and figures of a sweep state them.
+A stability map over two parameters also depends on all gains that were the same in every run.
+Without them, nobody could repeat the map. An entry of the list is, for example, "p_d of s: K
+10, gravity 1".
 
 Invariant:
-    - A gain is named unless an axis of the sweep changes it at every site, which is the process
-      that runs one arm. The defaults of a user's law are named too.
+    - A gain is named unless an axis of the sweep changes it for every arm. The defaults of a
+      user's law are named too.
 """
 
 import ast

@@ -10,14 +10,14 @@ colour of a cell depends on the runs of the sweep:
 - If growth exponents were measured, which are the rates at which small disturbances grow, it
   shows the exponent. White stands for zero.
 
+Vector files contain the cells as an image, because viewers show seams between adjacent shapes.
+The colours differ in lightness, for grey print and colour-blind readers.
+
 Invariant:
     - The page contains only results, lines and commands. Equal results give equal bytes.
     - The colour of a cell depends on its own results alone.
     - A cell is hatched if half or more of its runs are undecided, or if it should have an
       exponent and has none.
-    - Vector files contain the cells as an image, because viewers show seams between adjacent
-      shapes.
-    - The colours of the classes differ in lightness, for grey print and colour-blind readers.
 """
 
 import math

@@ -1,7 +1,7 @@
-"""Reads and writes the table of results of a sweep, `results.csv`, one row at a time.
+"""Writes and reads results.csv, the table of a sweep with one row per run, without loading it.
 
-A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore a
-table is written row by row, and the rows of a large table stay in its file.
+A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore
+rows are written one by one, and a large table stays in its file while it is used.
 
 Invariant:
     - Reading the CSV table restores all numbers bit for bit.
@@ -60,7 +60,9 @@ def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> It
 
 
 class ResultTable:
-    """Columns of the table of results of a sweep.
+    """Columns of the file results.csv of a sweep, with which its rows are written and read.
+
+    The columns depend on the sweep: each swept key has one.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -110,9 +112,10 @@ class ResultTable:
 
 
 class StoredRows(Sequence[ResultRow]):
-    """Rows of a table of results, which stay in its file and are read when they are needed.
+    """Rows of results.csv that stay in the file, for tables that are larger than the memory.
 
-    Only the offsets of the rows are in memory, 8 bytes for each.
+    The object can be used like a list. A row is read when it is needed. Only the offsets of the
+    rows are in memory, 8 bytes for each.
 
     Args:
         file: The CSV table.
@@ -180,7 +183,7 @@ class StoredRows(Sequence[ResultRow]):
     __hash__ = None  # type: ignore[assignment]
 
     def find_cell(self, number: int) -> list[ResultRow]:
-        """Returns the rows of one cell.
+        """Reads the rows of one cell from the file: its runs with different random seeds.
 
         Args:
             number: Number of the cell.

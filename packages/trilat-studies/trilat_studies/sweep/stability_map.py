@@ -1,12 +1,11 @@
 """Builds a stability map, which shows for which parameters a scenario is stable.
 
-A sweep runs one scenario, the description of an experiment, at every point of a grid of
-parameters, usually with several random seeds. The map draws the first two numeric parameters as
-axes x and y. Each combination of the other parameters and of the control law gets a panel. Each
-grid point of a panel shows how many of its runs were stable. A column is the set of grid points
-with the same x.
+A sweep runs one scenario at every point of a grid of parameters, usually with several random
+seeds. The map draws the first two numeric parameters as axes x and y. Each combination of the
+other parameters and of the control law gets a panel. Each grid point of a panel shows how many
+of its runs were stable. A column is the set of grid points with the same x.
 
-Limits from theory are drawn as lines:
+Limits from theory are drawn as lines, so that they can be compared with the runs:
 
 - The closed-form line is where a stability criterion in closed form is just met. It is used
   only if all assumptions of the criterion hold. For the proportional law with damping, P+d, the
@@ -22,8 +21,6 @@ Invariant:
       the other not. If undecided grid points lie between the two, the edge is wider.
     - A line crosses a column between two neighbouring grid points, of which the theory calls
       exactly one stable.
-    - The label of an axis names the scenario key with its unit. A gain has the unit that its
-      control law states.
 """
 
 import math
@@ -66,7 +63,7 @@ MAX_PANELS = 12
 
 
 class PlaneAxis(NamedTuple):
-    """One axis of a map: the values of a scenario key.
+    """One axis of a stability map: a scenario key, such as a delay, and its swept values.
 
     Attributes:
         key: Scenario key that varies along the axis, such as "link.delay_ms". Empty for the
@@ -189,10 +186,10 @@ class MapPlane(NamedTuple):
 
     @property
     def has_exponents(self) -> bool:
-        """True if the sweep has growth exponents instead of the end of each run.
+        """True if the map shows how fast disturbances grow, instead of how each run ended.
 
-        A growth exponent is the rate at which a small disturbance grows, in 1/s. It is measured
-        by twins, repeated runs with a small push, or is a root of the linear loop.
+        The rate at which a small disturbance grows, in 1/s, is called the growth exponent. It
+        is measured by repeating a run with a small push, or it is a root of the linear loop.
         """
         return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
 
@@ -203,9 +200,10 @@ class MapPlane(NamedTuple):
 
 
 def fill_panel(panel: MapPanel) -> MapPanel:
-    """Gives every grid point without runs the class of the nearest one, for drawing.
+    """Fills the grid points that a refined sweep did not run, so that a map can be drawn.
 
-    Growth exponents are interpolated linearly between the grid points that have one.
+    Such a point gets the class of the nearest point that was run. Growth exponents are
+    interpolated linearly between the grid points that have one.
 
     Args:
         panel: Panel of the map of a refined sweep.
@@ -331,7 +329,7 @@ class _PanelRuns:
         self.counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
 
     def add(self, run: Mapping[str, Any]) -> None:
-        """Counts a run.
+        """Counts a finished run at its grid point.
 
         Args:
             run: A row for `build_plane`.
@@ -461,7 +459,11 @@ class StabilityCriterion(NamedTuple):
 
 
 def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Evaluates a stability condition in closed form, known from theory, for a scenario.
+    """Evaluates for a scenario the stability condition in closed form that applies to it.
+
+    For example, equal arms under the law P+d are stable if the damping exceeds a certain
+    multiple of the stiffness times the delay. A map shows where the condition is just met,
+    beside the measured edge.
 
     Args:
         scenario: The scenario to which the condition is applied.
@@ -845,10 +847,11 @@ def _keep_columns(axis: PlaneAxis) -> _FineColumns:
 
 
 def refine_columns(axis: PlaneAxis) -> _FineColumns:
-    """Divides the intervals between the columns of a map, unless these are many already.
+    """Returns x values for lines from theory, more finely spaced than those of the map.
 
-    If the values are equally spaced, columns beside the outer ones let lines reach the borders
-    of the map.
+    The intervals between the columns are divided, unless there are many columns already. If the
+    values are equally spaced, values beside the outer columns let lines reach the borders of
+    the map.
 
     Args:
         axis: Horizontal axis of the map.
@@ -1344,7 +1347,7 @@ def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
 
 
 def thin_axis(axis: PlaneAxis, halvings: int) -> PlaneAxis:
-    """Returns the coarse part of an axis, with which a refined sweep begins.
+    """Returns every so many values of an axis: the coarse grid of a refined sweep.
 
     Args:
         axis: The axis.

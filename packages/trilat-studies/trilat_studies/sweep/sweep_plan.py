@@ -1,10 +1,9 @@
 """Plans a sweep: the runs of one scenario over a grid of parameters, control laws and seeds.
 
-A scenario is the description of an experiment. An axis is a key of the scenario together with
-the values that the key should have, such as "link.delay_ms=0:400:50". A cell is one combination
-of the values of all axes and of a control law. Each cell is run once per seed of the random
-numbers. This module parses the axes, laws and seeds, combines them with the scenario, and
-checks the result before anything runs.
+For example, the text "link.delay_ms=0:400:50" makes the network delay an axis of the grid, with
+the values 0 to 400 ms. One combination of the values of all axes and of a control law is called
+a cell. Each cell is run once per random seed. This module parses the axes, laws and seeds,
+combines them with the scenario, and checks the result before anything runs.
 
 Invariant:
     - A plan that cannot run is refused before the first run.
@@ -81,7 +80,7 @@ class _Steps:
 
 
 class _SweepAxis(NamedTuple):
-    """One axis of a sweep: a scenario key and its values.
+    """One swept scenario key with its values, as in "link.delay_ms=0:400:50".
 
     Attributes:
         description: The axis as the user wrote it, as "KEY=a:b:step" or "KEY=v1,v2,v3".
@@ -94,7 +93,7 @@ class _SweepAxis(NamedTuple):
     texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
-        """Returns one of the values that the sweep gives to the key of this axis.
+        """Returns the value of the swept key at an index, such as 50.0 for a delay.
 
         Args:
             number: Index of the value, from 0.
@@ -114,7 +113,7 @@ class _SweepAxis(NamedTuple):
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the text KEY=VALUE that sets the key of this axis to one of its values.
+        """Returns the override that sets one value of the key, as in "link.delay_ms=50".
 
         Args:
             number: Index of the value, from 0.
@@ -156,7 +155,7 @@ def parse_axis(description: str) -> _SweepAxis:
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Returns the texts of the axes, from any of the forms in which a user can give them.
+    """Converts the axes of a sweep, as a Python program may give them, to texts KEY=VALUES.
 
     Args:
         over: One text, a list of texts, or a mapping from keys to values. The values are a
@@ -317,7 +316,7 @@ _CHECKED_VALUES = 32
 
 
 class SweepCell(NamedTuple):
-    """One cell of a sweep: a combination of the values of all axes and of a control law.
+    """One combination of the parameter values of a sweep and of a control law.
 
     Attributes:
         number: Number of the cell, counted row by row from 0. The law changes slowest, and the
@@ -391,11 +390,11 @@ class SweepPlan(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """Number of cells of the grid: the product of the numbers of values and of laws."""
+        """Number of combinations of all parameter values and control laws."""
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
-        """Returns one combination of the swept parameters and the control law.
+        """Returns the combination of parameter values and control law with a given number.
 
         Args:
             number: Number of the combination, from 0, counted row by row in the grid of the
@@ -429,7 +428,7 @@ class SweepPlan(NamedTuple):
         return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Returns the scenario of the sweep with further overrides.
+        """Loads the scenario of the sweep, with further overrides such as those of one cell.
 
         Args:
             more: Further overrides KEY=VALUE.

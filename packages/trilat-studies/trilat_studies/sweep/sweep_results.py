@@ -1,18 +1,14 @@
-"""Stores and summarises the results of a sweep.
+"""Stores and summarises the results of a sweep over a grid of parameters.
 
-A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
-one combination of the swept parameters and the control law; it is run once per seed of the
-random numbers. This module turns the finished runs into a table with one row per run and writes
-it as CSV. It also combines the runs of a cell to a grid point, prints a summary, and finds the
-command that repeats a run.
+A sweep runs a scenario at every point of the grid. One point of the grid, called a cell, is run
+once per random seed. This module turns the finished runs into a CSV table with one row per run.
+It also combines the runs of a cell, prints a summary, and finds the command that repeats a run.
 
 Invariant:
-    - The results are a function of the plan. The bytes of the result files depend on the runs
-      alone, and not on the time or the number of worker processes.
+    - The bytes of the result files depend on the runs alone, and not on the time or the number
+      of worker processes.
     - Reading the CSV table restores all numbers bit for bit.
     - Running the scenario of a row again reproduces the row.
-    - A grid point counts each of its runs once. The stable share is the fraction of the decided
-      runs that are stable. Its 95 % Wilson interval lies within [0, 1].
     - Every printed command reproduces the run, with the same hash of the scenario as its row.
       If the source of the scenario has changed since the sweep, the command names a file to
       which the scenario of the row was written.
@@ -103,9 +99,7 @@ class SweepResults(Result):
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
-        """Returns the runs of one cell, one row per seed.
-
-        A cell is a combination of the values of all axes and of a control law.
+        """Returns the table rows of one combination of parameter values, one row per seed.
 
         Args:
             number: Number of the cell.
@@ -161,7 +155,7 @@ def iterate_cells(
 
 
 def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
-    """Yields the rows of the runs of one cell.
+    """Yields the table rows of one cell, a combination of swept parameters: one row per run.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -291,7 +285,7 @@ GRID_POINTS_FILE = "places.csv"
 
 
 class GridPoint(NamedTuple):
-    """The results of all runs of one cell of a sweep, which differ only in their seeds.
+    """Summary of all runs with the same parameter values, which differ only in their seeds.
 
     Attributes:
         cell: Number of the cell, from 0.
@@ -340,9 +334,10 @@ class GridPoint(NamedTuple):
 
 
 def list_totals(plan: SweepPlan) -> list[str]:
-    """Lists the keys of the quantities that are averaged over the seeds of a cell.
+    """Lists the measured quantities of which a sweep computes means over the seeds.
 
-    These are the totals that every run computes, and the metrics that the sweep requested.
+    They are the totals that every run computes, such as its RMS error, and the metrics that the
+    sweep requested.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

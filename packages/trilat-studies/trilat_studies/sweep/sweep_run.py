@@ -286,7 +286,9 @@ class FinishedSweep(NamedTuple):
 
 
 class CellItem(NamedTuple):
-    """One run of a sweep as an item for a worker process. It can be pickled.
+    """Everything that a worker process needs to execute one run of a sweep.
+
+    The object can be pickled, and is thus sent to the process.
 
     Attributes:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -628,7 +630,7 @@ class _NewRuns:
         self.simulated_s = 0.0
 
     def note(self, run: CellRun) -> None:
-        """Counts a run that has finished."""
+        """Counts a run that has finished, for the numbers that are printed at the end."""
         self.runs += 1
         self.simulated_s += run.outcome.ran_s
 
@@ -804,7 +806,11 @@ class _SweepWork:
 
 
 def find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
-    """Returns the side of the stability edge on which the runs of a cell lie.
+    """Returns on which side of the stability edge the runs of a cell lie.
+
+    The side is stable, unstable or undecided, by the majority of the runs. It is not known if
+    every run was refused. If the sweep measures growth exponents, a run with an exponent of at
+    most 0 is stable.
 
     Args:
         plan: The sweep. If it measures growth exponents, their sign decides.

@@ -14,14 +14,14 @@ arms would agree if gravity did not act on them:
 Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
 weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
 
-A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. For
-such a law, the distance between the arms is replaced by the distance of each arm from the
-promised motion, and a run is judged by where the promised motion ends instead of q*. The
-distance of the mean from q* stays part of the error, so that arms that do not move at all are
-no solution.
+A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. Then the
+distance of each arm from the promised motion counts instead of the distance between the arms,
+and a run is judged by where the promised motion ends. The distance of the mean from q* stays
+part of the error, so that arms that do not move at all are no solution.
 
-Walls, and operators who push without a target, do not determine a pose. If a scenario has them,
-its twin is run too, which is the same scenario without them.
+Walls, and operators who push without a target, do not determine a pose. A scenario that
+contains them is also run without them, to find the pose at which the arms would come to rest.
+This second scenario is called the twin of the first.
 
 Invariant:
     - A score is a function of the scenario alone. The errors of a run that does not reach its
@@ -29,10 +29,6 @@ Invariant:
     - Neither gains nor control laws enter q*.
     - Only settled runs, which are stable and end at q* or at the pose that their law promises,
       may be part of a Pareto front.
-    - The end of a log is reported if an arm hangs down (both of its links point down) and did
-      not hang at the start, even if all arms are close to each other. It is also reported if
-      the mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
-      explain the distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -82,9 +78,10 @@ _POSE_SAMPLES_HZ = 100.0
 
 
 def check_comparable(scenario: Scenario) -> None:
-    """Checks that control laws can be compared fairly in a scenario.
+    """Refuses a scenario in which control laws cannot be compared fairly.
 
-    The comparison needs a pose that all arms could reach.
+    The error of a law is measured from the pose on which the arms should agree. Therefore the
+    scenario must determine a pose that all arms could reach.
 
     Args:
         scenario: The scenario in which laws are to be compared.
@@ -334,8 +331,13 @@ _POSE_SAMPLES = 2000
 def check_final_posture(log: Log) -> list[str]:
     """Warns if the end of a run says little about its control law.
 
-    The warnings concern a run that is shorter than planned, and arms that hang down or fell.
-    The errors and torques of such arms are small, but not because of the control law.
+    There are three warnings:
+
+    - The run is shorter than planned.
+    - An arm hangs down (both of its links point down) and did not hang at the start. Its errors
+      and torques are small, but not because of the control law.
+    - The mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
+      explain the distance.
 
     Args:
         log: Log of the run.
@@ -412,7 +414,9 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """Measured score of a candidate. docs/reference/tuning-procedure.md has the formulas.
+    """What was measured about a control law with chosen gains: error, effort and class.
+
+    docs/reference/tuning-procedure.md has the formulas.
 
     Attributes:
         outcome: Class of the candidate.
@@ -746,7 +750,7 @@ def _rms(values: Array) -> float:
 
 
 class TuningScenario(NamedTuple):
-    """The scenario in which control laws are compared, with the overrides that produced it.
+    """The scenario in which control laws are compared, and the overrides that changed it.
 
     The overrides are kept so that commands can name the scenario as the user did.
 
@@ -826,7 +830,7 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """The runs of a control law with chosen gains, as they are sent to a worker process.
+    """Everything that a worker process needs to run a control law with chosen gains.
 
     Attributes:
         runs: For each random seed, the text of the scenario, and the text of the same scenario

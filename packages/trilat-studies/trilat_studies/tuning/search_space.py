@@ -1,10 +1,9 @@
-"""Defines which gains of each control law are tuned, and within which ranges.
+"""Defines which gains of each control law a tuning searches, and within which ranges.
 
-A search space lists the gains of a law, each with its unit and range. `SearchSpace.controls`
-turns chosen values into the table [control] of every arm in a scenario. Gains are searched
-uniformly in their logarithms. For a fair comparison, a quantity has the same range in every
-law. For example, the stiffness is called K in some laws, and is the product of Kp and Lambda in
-others. The damping is called d or Kp.
+For a fair comparison, a quantity has the same range in every law, whatever its name. For
+example, the stiffness is called K in some laws, and is the product of Kp and Lambda in others.
+Gains are searched uniformly in their logarithms. `SearchSpace.controls` turns chosen values
+into the table [control] of every arm in a scenario.
 
 Invariant:
     - A gain is a single number for both joints of an arm, and for all arms with the same role,
@@ -164,7 +163,7 @@ class _TunedGain(NamedTuple):
 
 
 class SearchSpace(NamedTuple):
-    """A control law with the ranges in which its gains are searched.
+    """The gains of one control law that are tuned, each with its unit and its range.
 
     Attributes:
         law: Name of the law. The name "known" stands for the law `adaptive` without adaptation,

@@ -1,19 +1,18 @@
-"""Plans and runs the tuning of control laws, and determines their Pareto fronts.
+"""Tunes the gains of several control laws, and finds the best compromises of each.
 
-The gains of every law are tuned in the same way, so that the laws can be compared fairly. A
-candidate is a law with a choice of gains. Two objectives are minimised: the error, and the
-effort of the motors. The Pareto front of a law consists of the candidates for which no other
-candidate is better in both.
+Two objectives are minimised: the error, and the effort of the motors. The result for a law is
+its Pareto front: the gains for which no other gains of the law are better in both. The laws can
+then be compared fairly, because each was given the same number of attempts (candidates).
 
-Every law gets the same number of candidates. The first half is a Latin hypercube, an evenly
-spread random sample, in the logarithms of the gains (McKay, Beckman and Conover, Technometrics
-21, 1979). The second half refines the law's own front, in four rounds with shrinking steps.
+The first half of the candidates is a Latin hypercube, an evenly spread random sample, in the
+logarithms of the gains (McKay, Beckman and Conover, Technometrics 21, 1979). The second half
+refines the law's own front, in four rounds with shrinking steps.
 
 Invariant:
     - The result is a function of the plan alone. It does not depend on the number of processes
       or on their speed.
     - The candidates are a function of the seed, the search space and the scores of earlier
-      rounds. Their number is the budget.
+      rounds.
     - Only stable runs that end at the common pose of the arms compete. Of two runs with equal
       objectives the first one is kept.
     - The gains that the paper prints are measured, but they are not searched and belong to no
@@ -70,9 +69,9 @@ ObjectivePoint = tuple[float, float]
 
 
 class Objective(StrEnum):
-    """Quantity that the search minimises together with the effort of the controllers.
+    """Quantity that a tuning minimises besides the motor effort: error or settling time.
 
-    Both conflict in general: a smaller error needs larger torques.
+    Both conflict with the effort in general: a smaller error needs larger torques.
     """
 
     ERROR = "error"
@@ -84,7 +83,7 @@ class Objective(StrEnum):
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns the point of a candidate in the plane of objective and effort.
+        """Returns the objective and the effort of a candidate, as a point for its Pareto front.
 
         Args:
             score: Score of the candidate.

@@ -1,15 +1,15 @@
 """Reports a comparison of control laws as tables, a Markdown page, JSON and a figure.
 
-The gains of each law were tuned by a search. The Pareto front of a law consists of the gains
-for which no other gains of the law are better in both error and effort, which is the RMS motor
-torque. The figure shows error against effort. `write_tuning` writes the files front.json,
-front.md, front.png and front.pdf.
+Before the comparison, the gains of each law were tuned by a search. The figure shows error
+against effort, the RMS motor torque, for the Pareto front of each law: the gains for which no
+other gains of the law are better in both. `write_tuning` writes the files front.json, front.md,
+front.png and front.pdf.
 
 Invariant:
     - The files are a function of the result alone. Repeating the same comparison gives equal
       bytes.
     - The JSON contains the complete result. The other files are views of it.
-    - The headers of the tables contain the units. Each run is counted in exactly one class.
+    - Each run is counted in exactly one class, such as stable or diverged.
     - The figure shows every stable run in which the arms end at the pose that the operators ask
       for, on a front or not. Stars mark the published gains of the adaptive law, which belong
       to no front.
