@@ -96,7 +96,7 @@ def test_demos_bear_their_scenarios_name_and_errors(stage: Stage) -> None:
     recording(stage)
     with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
         hand.move(*hand.pose)
-    running.prints("|e| ")
+    running.prints("; late ")
     running.signal(signal.SIGINT)
     assert running.code() == 130
     assert "session play; Ctrl-C ends it" in running.text()
