@@ -175,7 +175,7 @@ def damped(d: float) -> Scenario:
 
 
 def test_the_real_part_is_that_of_the_analysis() -> None:
-    growth_rates, _, remarks = GrowthColumn.compute([damped(d) for d in D], "control.d", D)
+    growth_rates, _, remarks, _ = GrowthColumn.compute([damped(d) for d in D], "control.d", D)
     assert remarks == []
     for d, growth in zip(D, growth_rates, strict=True):
         root = analyse_linear_loop(
@@ -190,7 +190,9 @@ def test_an_edge_is_where_the_sign_changes() -> None:
     (crossing,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
     assert remark == ""
     places = (crossing - 1e-4, crossing + 1e-4)
-    (below, above), edges, _ = GrowthColumn.compute([*map(damped, places)], "control.d", places)
+    (below, above), edges, *_ = GrowthColumn.compute(
+        [*map(damped, places)], "control.d", places
+    )
     assert below > 0.0 > above
     assert edges == {0: pytest.approx(crossing, rel=1e-6)}
     alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
@@ -213,7 +215,7 @@ def test_the_scheme_decides_the_loop() -> None:
 
 def test_nonlinear_loops_are_reported_as_unknown() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
-    growth_rates, edges, remarks = GrowthColumn.compute(
+    growth_rates, edges, remarks, _ = GrowthColumn.compute(
         [unknown, damped(3.0)], "control.d", (2.9, 3.0)
     )
     assert edges == {}

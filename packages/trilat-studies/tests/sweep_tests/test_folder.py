@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from trilat_studies import measure_run
 from trilat_studies.sweep.sweep_cell import CellRun
 from trilat_studies.sweep.sweep_run import (
     PLAN_FILE,
@@ -89,11 +90,11 @@ def test_another_arithmetic_or_program_is_refused(
     sweep_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
+        patch.setattr(measure_run, "compute_fingerprint", lambda: "0" * 16)
         reason = f"another kind of arithmetic: {compute_fingerprint()} in the folder, 0000"
         assert reason in refused(sweep_folder)
     older = {**collect_provenance(), "version_numba": "0.1"}
-    monkeypatch.setattr(folders, "collect_provenance", lambda: older)
+    monkeypatch.setattr(measure_run, "collect_provenance", lambda: older)
     with pytest.raises(UsageError, match=r"another version of the program: .*numba 0\.1"):
         open_sweep_folder(sweep_folder)
 
