@@ -187,7 +187,7 @@ def test_results_print_as_their_command_does(
     monkeypatch.chdir(file.parent)
     file = Path(file.name)
     more = {
-        "compare": [file],
+        "compare": [file, "--all"],
         "rerun": ["--replace", "s", "--set", "control.Kd=5"],
         "certify": ["--all"],
         "metrics": ["--all"],

@@ -209,7 +209,10 @@ def test_logs_are_read_without_their_code(law: Path, tmp_path: Path) -> None:
 
 def test_failing_laws_give_one_sentence_and_a_log(tmp_path: Path) -> None:
     done = trilat("sim", "two_sites", *SHORT, *FAILING, cwd=tmp_path)
-    done.refuses("tests.laws:Failing of s failed at tick 40: torque[1] is nan", code=1)
+    done.refuses(
+        "tests.laws:Failing of s failed at tick 40: torque[1] must be a finite number, but is nan",
+        code=1,
+    )
     assert open_log(tmp_path / "two_sites.mcap").complete
     checked = trilat("verify", "two_sites.mcap", "--virtual", "--law", LAWS, cwd=tmp_path)
     assert checked.code == 0
@@ -229,7 +232,10 @@ def test_a_failing_law_fails_its_trial(seeds: str, tmp_path: Path) -> None:
     done = trilat("test", "two_sites", "--seeds", seeds, *jitter, *FAILING, cwd=tmp_path)
     assert done.code == 1
     assert "no result: " in done.out
-    assert "tests.laws:Failing of s failed at tick 40: torque[1] is nan" in done.out
+    assert (
+        "tests.laws:Failing of s failed at tick 40: torque[1] must be a finite number, but is nan"
+        in done.out
+    )
 
 
 def test_failing_laws_in_reruns_are_one_sentence(tmp_path: Path) -> None:
