@@ -53,7 +53,7 @@ def test_the_version_is_that_of_the_package() -> None:
 @pytest.mark.parametrize(
     ("phrase", "found"),
     [
-        ("sim tw", {"two_sites"}),
+        ("sim tw", {"two_people", "two_sites"}),
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
         pytest.param("figure run.mcap se", {"settling"}, marks=pytest.mark.long),
         ("site --scenario two_sites ", {"m", "s"}),
