@@ -45,7 +45,7 @@ def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
 
 
 def delivered(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
-    """Returns a log of a run in which some samples took other than one tick, or never arrive."""
+    """Returns a log of a run whose samples take the given numbers of ticks, one by default, or are lost."""
     at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}
     for receiver, peer, tick in itertools.product(SCENARIO.names, (0, 1), range(TICKS)):
         if (receiver, peer, tick) not in lost:

@@ -127,7 +127,7 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
 
 
 def _describe_failed(names: Sequence[str]) -> str:
-    """Returns that the theorem does not apply, and what the premises that fail require."""
+    """Returns a sentence: the theorem does not apply, and what each failed premise requires."""
     premises = [f"{name} {REQUIREMENTS[name]}" for name in names]
     return f"the theorem does not apply (premises that fail: {'; '.join(premises)})"
 

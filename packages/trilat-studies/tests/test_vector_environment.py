@@ -241,8 +241,8 @@ def make_six_steps() -> tuple[Any, SyncVectorEnv]:
 def test_pictures_show_the_present_state() -> None:
     """Each sub-environment draws the state after the latest step."""
     fast, slow = make_six_steps()
-    for one, other in zip(fast.render(), slow.render(), strict=True):
-        assert np.array_equal(one, other)
+    for picture, expected in zip(fast.render(), slow.render(), strict=True):
+        assert np.array_equal(picture, expected)
 
 
 def test_saved_episodes_have_the_same_bytes(tmp_path: Path) -> None:
@@ -253,9 +253,9 @@ def test_saved_episodes_have_the_same_bytes(tmp_path: Path) -> None:
         for member, path in zip(env.get_attr("unwrapped"), paths, strict=True):
             member.save(path)
         logs.append([tn.open_log(path) for path in paths])
-    for one, other in zip(*logs, strict=True):
-        assert one["m"].q.shape == (120, 2)
-        assert np.array_equal(one["m"].q, other["m"].q)
+    for log, expected in zip(*logs, strict=True):
+        assert log["m"].q.shape == (120, 2)
+        assert np.array_equal(log["m"].q, expected["m"].q)
 
 
 def test_refused_actions_advance_no_environment() -> None:

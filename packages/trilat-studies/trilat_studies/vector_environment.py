@@ -249,7 +249,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return self._join(batch, observations), infos
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Calls a method of each environment, or reads an attribute of each, by its name.
+        """Calls the method `name` of each environment, or reads the attribute of that name.
 
         The states of the episodes are written into the environments before, because an
         environment does not take part in the joint simulation itself.
@@ -445,14 +445,14 @@ class _LaneEnvs:
             results: Receives the results.
         """
         count = len(self._envs)
-        own = slice(self._first, self._first + count)
-        is_active = self._is_loaded & is_stepped[own]
+        block = slice(self._first, self._first + count)
+        is_active = self._is_loaded & is_stepped[block]
         if not is_active.any():
             return
         lanes = np.arange(count)
         rows = self._steps[is_active]
-        self._actions[lanes[is_active], rows] = actions[own][is_active]
-        self._clipped[is_active] += exceeds[own][is_active]
+        self._actions[lanes[is_active], rows] = actions[block][is_active]
+        self._clipped[is_active] += exceeds[block][is_active]
         self._advance(is_active)
         self._steps[is_active] += 1
         state = _State(self, self._lanes, count)

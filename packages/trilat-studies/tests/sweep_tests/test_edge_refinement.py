@@ -52,13 +52,13 @@ def refine_all(plan: SweepPlan, side_at: Side) -> tuple[np.ndarray, np.ndarray]:
     _, columns, rows = plan.shape
     full = np.array([[side_at(i, j) for j in range(rows)] for i in range(columns)])
     refinement = EdgeRefinement(plan)
-    found = np.full(full.shape, NOT_KNOWN)
+    refined_sides = np.full(full.shape, NOT_KNOWN)
     sides: dict[int, int] = {}
     while cells := refinement.find_next_cells(sides):
-        assert (found.reshape(-1)[cells] == NOT_KNOWN).all()
+        assert (refined_sides.reshape(-1)[cells] == NOT_KNOWN).all()
         sides = {cell: int(full.reshape(-1)[cell]) for cell in cells}
-        found.reshape(-1)[cells] = full.reshape(-1)[cells]
-    return full, found
+        refined_sides.reshape(-1)[cells] = full.reshape(-1)[cells]
+    return full, refined_sides
 
 
 @settings(max_examples=25, deadline=None)
@@ -77,8 +77,8 @@ def test_both_sides_of_a_rising_edge_run(
     def side_at(i: float, j: float) -> int:
         return int((j < first + slope * x * (i / x) ** bend) == stable_below)
 
-    full, found = refine_all(grid(x, y, refine), side_at)
-    ran = found != NOT_KNOWN
+    full, refined_sides = refine_all(grid(x, y, refine), side_at)
+    ran = refined_sides != NOT_KNOWN
     for axis in (0, 1):
         differs = np.diff(full, axis=axis) != 0
         both_ran = np.delete(ran, -1, axis) & np.delete(ran, 0, axis)
@@ -89,15 +89,17 @@ def test_a_fine_grid_needs_few_of_its_cells() -> None:
     def side_at(i: float, j: float) -> int:
         return STABLE if j > 30 + 120 * (i / 200) ** 0.5 else UNSTABLE
 
-    full, found = refine_all(grid(201, 201, 5), side_at)
-    assert np.count_nonzero(found != NOT_KNOWN) <= full.size / 20
+    full, refined_sides = refine_all(grid(201, 201, 5), side_at)
+    assert np.count_nonzero(refined_sides != NOT_KNOWN) <= full.size / 20
 
 
 def test_cells_without_a_side_draw_no_edge() -> None:
     """A part of the grid is not valid; its border is not refined."""
-    full, found = refine_all(grid(65, 65, 4), lambda i, _: NOT_KNOWN if i > 30 else STABLE)
+    full, refined_sides = refine_all(
+        grid(65, 65, 4), lambda i, _: NOT_KNOWN if i > 30 else STABLE
+    )
     coarse = EdgeRefinement(grid(65, 65, 4)).list_coarse_cells()
-    assert np.count_nonzero(found == STABLE) == np.count_nonzero(
+    assert np.count_nonzero(refined_sides == STABLE) == np.count_nonzero(
         full.reshape(-1)[coarse] == STABLE
     )
 

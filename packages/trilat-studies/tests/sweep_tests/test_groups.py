@@ -36,11 +36,11 @@ def test_every_cell_is_in_one_group(sizes: list[int], data: st.DataObject) -> No
 def test_axes_that_change_structure_split_cells(
     over: list[str], laws: list[str], groups: int, keys: tuple[str, ...] | None
 ) -> None:
-    found = find_cell_groups(plan_sweep("free", over=over, laws=laws))
-    assert found.group_count == groups
-    assert keys is None or found.keys == keys
-    assert bool(found.sentence) == (groups > 1)
-    assert all(key in found.sentence for key in found.keys)
+    cell_groups = find_cell_groups(plan_sweep("free", over=over, laws=laws))
+    assert cell_groups.group_count == groups
+    assert keys is None or cell_groups.keys == keys
+    assert bool(cell_groups.sentence) == (groups > 1)
+    assert all(key in cell_groups.sentence for key in cell_groups.keys)
 
 
 def test_cells_of_one_structure_run_together() -> None:

@@ -17,11 +17,11 @@ def test_lanes_do_not_change_scores(monkeypatch: pytest.MonkeyPatch) -> None:
         advance_to(lanes, until_s)
 
     monkeypatch.setattr(LaneRun, "advance_to", count_calls)
-    found = []
+    reports = []
     for has_code in (True, False):
         monkeypatch.setattr(run_groups, "has_lane_code", lambda _, has=has_code: has)
         calls.clear()
         result = tn.tune("free", ["p_d"], budget=6, seeds=2, duration_s=2.3, jobs=1)
-        found.append(result.to_dict())
+        reports.append(result.to_dict())
         assert bool(calls) is has_code
-    assert found[0] == found[1]
+    assert reports[0] == reports[1]
