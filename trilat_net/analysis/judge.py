@@ -20,6 +20,7 @@ import msgspec
 from ..execution import FusedRun, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
+from .blas_threads import limit_blas_threads
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import find_missing_functionals
 from .certificate.stability_certificate import Certificate, certify
@@ -63,6 +64,7 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
     return list(dict.fromkeys(proofs))
 
 
+@limit_blas_threads()
 def certify_run(
     log: Log,
     *,
@@ -127,6 +129,7 @@ class _VirtualJudgement(NamedTuple):
     decision: StabilityDecision
 
 
+@limit_blas_threads()
 def judge_virtual_run(
     scenario: Scenario, run: FusedRun, end: RunEnd | None = None
 ) -> _VirtualJudgement:

@@ -17,10 +17,6 @@ this module computes the rightmost ones, in two steps:
    does so for multiple roots that have as many vectors v, as in loops of identical arms. Ruhe,
    "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
-`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices. OpenBLAS otherwise
-divides products of a hundred rows among all cores and waits for them actively, which takes a
-hundred times as long if another process occupies a core.
-
 Invariant:
     - A root solves the equation to rounding, for every discretisation that supplies its guess.
     - Some roots are zero for every delay, because the equations do not change if all arms are
@@ -28,20 +24,17 @@ Invariant:
       counted, and never called the rightmost.
 """
 
-import ctypes
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import cache
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.linalg
 from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 from scipy.linalg import eigvals
 
 from ...core import Array
+from ..blas_threads import limit_blas_threads
 from .linear_loop import LinearLoop
 
 Complex = NDArray[np.complex128]
@@ -80,55 +73,6 @@ MAX_GENERATOR_SIZE = 1600
 """Number of rows of the largest discretisation, whose eigenvalues take some seconds."""
 _ROOT_AGREEMENT = 1e-9
 """Largest difference of roots of two orders that agree, relative to 1 + abs(s)."""
-_BLAS_SYMBOLS = (
-    "scipy_openblas_{}_num_threads64_",
-    "openblas_{}_num_threads64_",
-    "openblas_{}_num_threads",
-)
-"""Names of OpenBLAS's functions in the builds of NumPy; "{}" stands for "get" or "set"."""
-
-
-@contextmanager
-def limit_blas_threads() -> Iterator[None]:
-    """Limits NumPy's linear algebra (BLAS) to one thread while the context is active.
-
-    For the small matrices of a loop, several threads cost more time than they save. The number
-    of threads is restored at the end, also after an exception. If the BLAS library has no
-    functions for this, the context has no effect.
-    """
-    functions = _find_blas_functions()
-    if functions is None:
-        yield
-        return
-    get_threads, set_threads = functions
-    previous_count = get_threads()
-    set_threads(1)
-    try:
-        yield
-    finally:
-        set_threads(previous_count)
-
-
-@cache
-def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | None:
-    """Returns the functions that read and set the number of threads of OpenBLAS.
-
-    Returns:
-        The two functions. None if NumPy uses another library.
-    """
-    module = getattr(numpy.linalg, "_umath_linalg", None)
-    try:
-        library = ctypes.CDLL(module.__file__)  # type: ignore[union-attr]
-    except (AttributeError, OSError, TypeError):
-        return None
-    for name in _BLAS_SYMBOLS:
-        try:
-            get_threads = getattr(library, name.format("get"))
-            set_threads = getattr(library, name.format("set"))
-        except AttributeError:
-            continue
-        return get_threads, set_threads
-    return None
 
 
 class Pencil(NamedTuple):

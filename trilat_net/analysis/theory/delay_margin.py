@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from ...core import Array
 from ...errors import count_nouns
+from ..blas_threads import limit_blas_threads
 from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
@@ -254,7 +255,7 @@ def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
     pencil, *_ = characteristic_roots.find_moving_part(common_loop)
     if not len(pencil.delays):
         return [], False
-    with characteristic_roots.limit_blas_threads():
+    with limit_blas_threads():
         sweep = _FrequencySweep(pencil)
         grid = sweep.build_grid()
         moduli = np.abs(sweep.compute_eigenvalues(grid))

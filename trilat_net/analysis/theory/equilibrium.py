@@ -22,9 +22,9 @@ from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution import FusedRun
 from ...own_code import ImportedLaw
 from ...scenario import Chirp, Multisine, Scenario
+from ..blas_threads import limit_blas_threads
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop
-from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (

@@ -49,6 +49,7 @@ from scipy.linalg import block_diag, expm
 
 from ...core import Array, IntArray, Law, Scheme, SiteSetup
 from ...scenario import LinkBase, draw_used_samples
+from ..blas_threads import limit_blas_threads
 from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from .characteristic_roots import (
     NAMED_SHARE,
@@ -58,7 +59,6 @@ from .characteristic_roots import (
     Pencil,
     Spectrum,
     extract_moving_part,
-    limit_blas_threads,
 )
 from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
 from .linear_loop import SiteJacobian, compute_couplings, differentiate_rates

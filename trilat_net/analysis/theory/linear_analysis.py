@@ -39,6 +39,7 @@ from ...scenario import (
     lacks_detailed_balance,
     load_scenario,
 )
+from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
@@ -322,6 +323,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     return _AnalysedLoop(scenario, conditions, rest, end.uses, end.distance_rad)
 
 
+@limit_blas_threads()
 def analyse_linear_loop(
     source: str | Path | Scenario | Log,
     overrides: Mapping[str, Any] | Sequence[str] = (),

@@ -28,6 +28,7 @@ from scipy.optimize import brentq
 from ...core import Array, Law, TorqueKind
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, load_scenario
+from ..blas_threads import limit_blas_threads
 from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
 from .equilibrium import (
     choose_equilibrium,
@@ -63,6 +64,7 @@ MEAN_POSE_REMARK = (
 )
 
 
+@limit_blas_threads()
 def find_rightmost_root(
     conditions: OperatingConditions,
     rest: Equilibrium,
@@ -116,6 +118,7 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     return deepest if depth_m[deepest] > 0.0 else None
 
 
+@limit_blas_threads()
 def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
     """Returns the growth rate of small motions while an arm touches a wall, in 1/s.
 

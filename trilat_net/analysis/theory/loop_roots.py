@@ -37,6 +37,7 @@ from ...log import Ints, Log
 from ...own_code import ImportedLaw
 from ...records import NS_PER_S
 from ...scenario import ConstantDelay, LinkBase, Scenario, draw_used_samples
+from ..blas_threads import limit_blas_threads
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
@@ -100,6 +101,7 @@ class _EndLoop(NamedTuple):
         return compute_sampled_spectrum(self.conditions, self.rest, count, self.uses)
 
 
+@limit_blas_threads()
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     """Computes whether small motions about the end pose of a recorded run die away.
 
@@ -121,6 +123,7 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     return _compute_roots(loop)
 
 
+@limit_blas_threads()
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     """Computes whether small motions about the end pose of a simulated run die away.
 

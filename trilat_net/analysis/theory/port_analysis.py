@@ -36,6 +36,7 @@ from ...errors import UsageError, count_nouns
 from ...results import finite_or_none
 from ...scenario import TASK_AXES, Scenario
 from ..arm_rows import build_arm_rows
+from ..blas_threads import limit_blas_threads
 from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, compute_delay_spectrum
@@ -268,6 +269,7 @@ class PortAnalysis(NamedTuple):
         return f"{linear} and {angular}" if has_rotations else linear
 
 
+@limit_blas_threads()
 def analyse_ports(
     scenario: Scenario,
     rest: Equilibrium,
