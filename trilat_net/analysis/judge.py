@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..execution import FusedRun, simulate_scenario
+from ..execution import FusedRun, simulate_columns, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .blas_threads import limit_blas_threads
@@ -164,7 +164,10 @@ def judge_virtual_run(
     is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)
     ticks = sum(site.rate_hz for site in ended.sites.values()) * ended.duration_s
     if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(ended):
-        recorded = certify(simulate_scenario(ended), own_laws=True)
+        # Only a written log contains the memories from which laws compute declared energies.
+        declares_energies = bool(find_energy_laws(ended, own_laws=True))
+        log = simulate_scenario(ended) if declares_energies else simulate_columns(ended)
+        recorded = certify(log, own_laws=True)
         certificate = replace(
             recorded,
             roots=findings.roots,
