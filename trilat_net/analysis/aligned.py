@@ -426,7 +426,6 @@ class PeerTrajectory:
             t_s: Times after the start of the session, shape (K,), in s.
         """
         records = self.records
-        h = records.h_s
         position = t_s * records.rate_hz - records.first
         nearest = np.round(position)
         is_at_tick = np.abs(position - nearest) < _TICK_TOLERANCE
@@ -436,8 +435,37 @@ class PeerTrajectory:
         known_period = np.clip(period, 0, last_period)
         row = known_period.astype(np.int64)
         fraction = np.clip(position - row, 0.0, 1.0)
-        x = fraction[:, np.newaxis]
 
+        q = records.shared[row]
+        qd = records.shared_rate[row]
+        squares = self._squares[row]
+        # If the sites have the same tick rate, nearly all times are ticks of this site.
+        between = np.flatnonzero(fraction)
+        if len(between):
+            interpolated = self._interpolate(row[between], fraction[between])
+            q[between], qd[between], squares[between] = interpolated
+
+        known_a = records.known[row] | (fraction == 1.0)
+        known_b = records.known[row + 1] | (fraction == 0.0)
+        # the arm rests before a session whose start is recorded
+        is_after_start = (position >= 0.0) | (records.first == 0)
+        known = known_a & known_b & is_after_start
+
+        is_before = position < 0.0
+        qd[is_before] = 0.0
+        squares[is_before] = 0.0
+        return _PeerMotion(q, qd, squares, known)
+
+    def _interpolate(self, row: Ints, fraction: Array) -> tuple[Array, Array, Array]:
+        """Returns the motion between two ticks: q, qd, and the integral of qd squared.
+
+        Args:
+            row: Row of the tick before each time, shape (K,).
+            fraction: Share of the tick period that has passed at each time, shape (K,).
+        """
+        records = self.records
+        h = records.h_s
+        x = fraction[:, np.newaxis]
         qa = records.shared[row]
         qb = records.shared[row + 1].copy()
         va = records.shared_rate[row]
@@ -451,23 +479,14 @@ class PeerTrajectory:
         quadratic = 3 * (qb - qa) - h * (2 * va + vb)
         cubic = 2 * (qa - qb) + h * (va + vb)
         q = qa + x * (h * va + x * (quadratic + x * cubic))
+        q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
         qd = va + x * (vb - va)
+
         squared_a = va**2
         squared_b = vb**2
         mean_square = squared_a + 0.5 * x * (squared_b - squared_a)
         squares = self._squares[row] + h * x * mean_square
-
-        known_a = records.known[row] | (fraction == 1.0)
-        known_b = records.known[row + 1] | (fraction == 0.0)
-        # the arm rests before a session whose start is recorded
-        is_after_start = (position >= 0.0) | (records.first == 0)
-        known = known_a & known_b & is_after_start
-
-        q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
-        is_before = position < 0.0
-        qd[is_before] = 0.0
-        squares[is_before] = 0.0
-        return _PeerMotion(q, qd, squares, known)
+        return q, qd, squares
 
 
 class DelayedPeer(NamedTuple):

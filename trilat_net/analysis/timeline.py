@@ -243,7 +243,7 @@ def find_mode_intervals(part: SiteLog) -> list[_ModeInterval]:
         The intervals. Empty if the arm followed the others all the time.
     """
     modes: list[str] = part.mode.tolist()
-    if all(MODES[mode].follows for mode in modes):
+    if all(MODES[mode].follows for mode in set(modes)):
         return []
 
     times_s = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
