@@ -218,12 +218,9 @@ class PlacedArm:
             a: Reference accelerations of the joints, shape (2, ...), in rad/s^2.
         """
         columns = self.q.shape[1:]
-        ones = np.ones(columns)
-        torques = []
-        for unit_parameters in np.multiply.outer(np.eye(5), ones):
-            unit_torque = self.required_torque(unit_parameters, qd, v, a)
-            torques.append(unit_torque)
-        return np.stack(torques, axis=1)
+        # one further axis, for the arms of which one parameter is 1
+        unit_parameters = np.multiply.outer(np.eye(5), np.ones(columns))
+        return self.required_torque(unit_parameters, qd, v, a)
 
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns zeros, shape (2, ...), because this arm has no friction in its joints.

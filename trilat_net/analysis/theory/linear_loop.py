@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, qr
+from scipy.linalg import qr
 
 from ...core import POSITION, Array, SiteSetup
 from ...laws import BlockKey, LinearForm
@@ -133,6 +133,26 @@ class LinearLoop(NamedTuple):
         return sum(delayed, self.A)
 
 
+def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
+    """Returns a matrix with given blocks on its diagonal, and zeros elsewhere.
+
+    `scipy.linalg.block_diag` does the same, but takes twenty times as long for small blocks.
+
+    Args:
+        blocks: The blocks, from the upper left one.
+    """
+    rows, columns = np.sum([block.shape for block in blocks], axis=0)
+    matrix = np.zeros((rows, columns))
+    row = 0
+    column = 0
+    for block in blocks:
+        height, width = block.shape
+        matrix[row : row + height, column : column + width] = block
+        row += height
+        column += width
+    return matrix
+
+
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Collects the states and inputs of each site when all arms are at rest.
 
@@ -159,8 +179,10 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
         x[layout.q_des] = references[i]
 
     # the peers' torques follow from the arguments so far
-    all_rates = conditions.evaluate_rates(arguments)
-    reflected = [rates.reflected for rates in all_rates]
+    reflected = [
+        site_dynamics.compute_reflected_torque(site, x)
+        for site, x in zip(conditions.sites, arguments, strict=True)
+    ]
     peer_torques = conditions.alpha @ reflected
     for i, (layout, x) in enumerate(site_arguments):
         x[layout.peer_torque] = peer_torques[i]
@@ -289,7 +311,7 @@ def compute_couplings(
         zero = np.zeros((m, m))
         share = conditions.alpha[i, j] * np.eye(m)
         reference = references.get((i, j), zero)
-        coupling = block_diag(reference, share, share)
+        coupling = join_diagonal_blocks([reference, share, share])
 
         if layout.peers:
             length = len(coupling)

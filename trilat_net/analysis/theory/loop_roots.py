@@ -45,7 +45,7 @@ from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
-from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
+from .floquet import DRAWN_SPAN_S, SampledLoop, SamplesInUse
 from .linear_edge import find_deepest_contact
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
@@ -88,17 +88,6 @@ class _EndLoop(NamedTuple):
     distance_rad: float
     last_pose: Equilibrium | None = None
     programs: tuple[str, ...] = ()
-
-    def compute_sampled_roots(self, count: int) -> Spectrum | None:
-        """Computes the rightmost roots of the loop, whose controllers compute once per tick.
-
-        Args:
-            count: Number of roots.
-
-        Returns:
-            The roots. None if a control law can be linearised in continuous time only.
-        """
-        return compute_sampled_spectrum(self.conditions, self.rest, count, self.uses)
 
 
 @limit_blas_threads()
@@ -215,8 +204,11 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         raise ScenarioError("the run diverged", source=scenario.name)
     ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     changes_links = any(change.link for change in ended.timeline)
-    if changes_links and any(_list_unknown_delays(_end_traces(ended)).values()):
-        # Only a log shows which samples are in use while one model of delays replaces another.
+    has_outages = any(link.outages_s for link in ended.links.values())
+    has_unknown_delays = any(_list_unknown_delays(_end_traces(ended)).values())
+    if has_unknown_delays and (changes_links or has_outages):
+        # Only a log shows which samples are in use while one model of delays replaces another,
+        # or during an outage.
         return find_log_loop(simulate_scenario(ended), own_laws=True)
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
@@ -348,8 +340,9 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
     Args:
         loop: The loop at the end of a run.
     """
-    sampled = loop.compute_sampled_roots(_ROOTS)
-    if sampled is not None:
+    if not loop.conditions.has_forms:
+        sampled_loop = SampledLoop(loop.conditions, loop.uses)
+        sampled = sampled_loop.compute_spectrum(loop.rest, _ROOTS)
         laws = loop.scenario.controls
         has_imported_law = any(isinstance(law, ImportedLaw) for law in laws)
         # Roots show growth, but may miss what happens beyond a threshold: in a user's law, or
@@ -360,8 +353,7 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         exact = sampled.is_exact and is_proof_possible and not loop.programs
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
-            last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
-            exact = _has_same_sign(sampled, last_roots)
+            exact = _has_same_sign(sampled_loop, sampled, loop.last_pose)
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
         return roots._replace(
             distance_rad=loop.distance_rad,
@@ -389,20 +381,24 @@ def _name_left_out(programs: Sequence[str]) -> str:
     return f"how the programs at {join_words(programs)} react to the arms"
 
 
-def _has_same_sign(at_rest: Spectrum, at_last_pose: Spectrum | None) -> bool:
+def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium) -> bool:
     """Returns True if the rightmost roots at a rest and at the last pose have the same sign.
 
     At a pose that is no rest, the roots at zero are slightly off. Therefore a root below a
     tenth of the one at the rest counts as zero.
 
     Args:
-        at_rest: The roots at the rest next to the end of a run.
-        at_last_pose: The roots at its last pose. None if they could not be computed.
+        loop: The loop at the end of the run.
+        at_rest: Its roots at the rest next to the end of the run.
+        last_pose: The last pose of the run.
     """
-    if at_last_pose is None or at_rest.rightmost is None or at_last_pose.rightmost is None:
-        return at_last_pose is not None
+    if at_rest.rightmost is None:
+        return True
     rate_per_s = at_rest.rightmost.s.real
-    grows_at_last = at_last_pose.rightmost.s.real > _ZERO_SHARE * abs(rate_per_s)
+    last_rate_per_s = loop.measure_rightmost_rate(last_pose, rate_per_s)
+    if last_rate_per_s is None:
+        return True
+    grows_at_last = last_rate_per_s > _ZERO_SHARE * abs(rate_per_s)
     return grows_at_last == (rate_per_s > 0.0)
 
 

@@ -15,6 +15,7 @@ Invariant:
 """
 
 from collections.abc import Iterator
+from functools import cache
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -108,16 +109,13 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
     """
     layout = site.layout
     if isinstance(site.law_factory, NumericLaw):
-        return ArgumentLayout(
-            joints=layout.joints,
-            parameters=len(site.law_factory.memory),
-            peers=len(site.links),
-        )
-    return ArgumentLayout(
-        joints=layout.joints,
-        parameters=layout.parameters,
-        shared=layout.shared,
-    )
+        memories = len(site.law_factory.memory)
+        return _make_layout(layout.joints, memories, 0, len(site.links))
+    return _make_layout(layout.joints, layout.parameters, layout.shared, 0)
+
+
+# An analysis evaluates the same few sites hundreds of times.
+_make_layout = cache(ArgumentLayout)
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
@@ -178,14 +176,21 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
         The errors of position and velocity, the reference velocity and acceleration for the
         joints, and the related Jacobian.
     """
-    layout = lay_out_arguments(site)
+    return _follow(site, arm, x, lay_out_arguments(site))
+
+
+def _follow(
+    site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, layout: ArgumentLayout
+) -> Following:
+    """Computes errors and reference motion, see `compute_following`, with a given layout."""
     Lambda = _as_columns(site.gains.Lambda, x)
     q = x[layout.q]
     qd = x[layout.qd]
     reference = x[layout.q_des]
     reference_rate = x[layout.qd_des]
 
-    if site.layout.task and isinstance(arm, PlacedChain):
+    has_task = site.chain is not None and site.chain.task is not None
+    if has_task and isinstance(arm, PlacedChain):
         return follow_in_task(
             site=site,
             arm=arm,
@@ -232,20 +237,20 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])
     qd = x[layout.qd]
-    following = compute_following(site, arm, x)
+    following = _follow(site, arm, x, layout)
 
-    continuous = _sum_actors(site, arm, x, sampled=False)
+    continuous = _sum_actors(site, arm, x, layout, sampled=False)
     external = x[layout.external_torque] + continuous
-    held = _sum_actors(site, arm, x, sampled=True)
+    held = _sum_actors(site, arm, x, layout, sampled=True)
 
     if isinstance(site.law_factory, NumericLaw):
         state_and_inputs = x[: layout.inputs.stop]
         law_arguments = np.concatenate([state_and_inputs, external + held])
         tau, estimate_rate = site.law_factory.evaluate(law_arguments)
     elif has_estimate(site):
-        tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x)
+        tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x, layout)
     else:
-        tau = _evaluate_known_gravity_law(site, arm, following, x)
+        tau = _evaluate_known_gravity_law(site, arm, following, x, layout)
         estimate_rate = 0.0 * x[layout.estimate]
 
     torque = tau + external + held
@@ -261,6 +266,24 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
         xd=following.xd,
         reflected=following.from_joints(external + held),
     )
+
+
+def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
+    """Computes the torque of operators and environments that a site sends to the other sites.
+
+    It is the entry `reflected` of `evaluate_site_rates`, without the other entries.
+
+    Args:
+        site: Setup of the site.
+        x: States and inputs in the order of `lay_out_arguments`, shape (arguments, ...).
+    """
+    layout = lay_out_arguments(site)
+    arm = place_arm(site, x[layout.q])
+    following = _follow(site, arm, x, layout)
+    continuous = _sum_actors(site, arm, x, layout, sampled=False)
+    external = x[layout.external_torque] + continuous
+    held = _sum_actors(site, arm, x, layout, sampled=True)
+    return following.from_joints(external + held)
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
@@ -312,12 +335,12 @@ def _evaluate_known_gravity_law(
     arm: PlacedArm | PlacedChain,
     following: Following,
     x: Numbers,
+    layout: ArgumentLayout,
 ) -> Numbers:
     """Returns the torque of a law with known gravity, shape (n, ...), in N m.
 
     The law is tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), with J = 1 in joint space.
     """
-    layout = lay_out_arguments(site)
     gains = site.gains
     q = x[layout.q]
     qd = x[layout.qd]
@@ -343,6 +366,7 @@ def _evaluate_adaptive_law(
     arm: PlacedArm | PlacedChain,
     following: Following,
     x: Numbers,
+    layout: ArgumentLayout,
 ) -> tuple[Numbers, Numbers]:
     """Returns the torque of an adaptive law, in N m, and the rate of its estimate.
 
@@ -353,7 +377,6 @@ def _evaluate_adaptive_law(
               - (1 - known) friction(v)
         theta_hat' = -Gamma Y' r
     """
-    layout = lay_out_arguments(site)
     gains = site.gains
     q = x[layout.q]
     qd = x[layout.qd]
@@ -413,6 +436,7 @@ def _sum_actors(
     site: SiteSetup,
     arm: PlacedArm | PlacedChain,
     x: Numbers,
+    layout: ArgumentLayout,
     *,
     sampled: bool,
 ) -> Numbers:
@@ -422,12 +446,12 @@ def _sum_actors(
         site: Setup of the site, with the operators and environments in force.
         arm: The arm in the pose of x.
         x: Arguments of the site's rates, shape (arguments, ...).
+        layout: Where x contains the angles and velocities.
         sampled: True for those that act once per tick, False for those that act continuously.
 
     Returns:
         Torque on the joints, shape (n, ...), in N m.
     """
-    layout = lay_out_arguments(site)
     q = x[layout.q]
     qd = x[layout.qd]
     total: Numbers = 0.0 * q

@@ -115,6 +115,8 @@ class LawChannel(NamedTuple):
         This is the length of the field `ch` of a record. A vector of which each peer (the
         process of another arm) gets its own counts once for each peer.
         """
+        if not self.vectors:
+            return 0
         to_all = self.count_numbers(per_peer=False)
         to_each = self.count_numbers(per_peer=True)
         return to_all + self.peers * to_each
