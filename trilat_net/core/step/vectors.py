@@ -106,11 +106,12 @@ def whole(number: float) -> int:
 def count_started(table: Any, first: int, count: int, now: float) -> int:
     """Returns how many rows of a time table start at a given time or before.
 
-    The rows are sorted by time, which is their first column, so that bisection finds the count.
+    For example, this finds the row of a recorded torque that applies now. The rows are sorted
+    by time, their first column, so that bisection finds the count.
 
     Args:
         table: The table.
-        first: Index of the first row to search; the table may contain rows of other owners.
+        first: Index of the first row to search. Rows before it have another purpose.
         count: Number of rows to search.
         now: The time, in the unit of the first column.
 
