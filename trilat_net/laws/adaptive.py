@@ -139,6 +139,6 @@ class Adaptive(ControlLaw):
 
         Args:
             gains: The tuned gains by name.
-            site: The site whose table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "theta_hat0": site.estimate}

@@ -96,7 +96,7 @@ class AdaptiveBox(Adaptive):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         They contain the tuned gains, the estimate of the arm's parameters with which the law
@@ -104,7 +104,7 @@ class AdaptiveBox(Adaptive):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         control = Adaptive.write_control(gains, site)
         low, high = site.box

@@ -117,7 +117,7 @@ class AdaptiveRobust(AdaptiveBox):
         the arm are within the box, the bounds in which the law searches for them.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The bound as a string. It holds if all delays are constant, and is undecided
@@ -138,7 +138,7 @@ class AdaptiveRobust(AdaptiveBox):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The robust term -rho r / sqrt(r^2 + width^2) of this law acts like a damping rho / width
@@ -147,7 +147,7 @@ class AdaptiveRobust(AdaptiveBox):
 
         Args:
             gains: Tuned gains by name, with rho as `rho_nm`.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
         control = AdaptiveBox.write_control(gains, site)

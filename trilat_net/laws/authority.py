@@ -143,7 +143,7 @@ class Authority(ControlLaw):
         slave is not used.
 
         Args:
-            situation: The site, and the laws of all sites.
+            situation: This arm, and the laws of all arms.
 
         Returns:
             A sentence for the user. Empty if the site is the slave, or if all sites are users.
@@ -157,14 +157,14 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         For the arm of a user, the loop is a spring with a damper between the two users, whose
         known condition is used. The slave follows the users, but nobody follows the slave. It
         closes no loop and is stable for every delay.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition. None if the law does not compensate gravity exactly, because then no
@@ -187,7 +187,7 @@ class Authority(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment. A
         site is the process that runs one arm. At the masters, which are the arms of the two
@@ -196,6 +196,6 @@ class Authority(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "leads": site.role == "master", "gravity": site.gravity}

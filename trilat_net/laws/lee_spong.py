@@ -97,13 +97,13 @@ class LeeSpong(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         The known condition for a spring with a damper is used. It bounds the damping from below
         by the stiffness times the delay.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition. None if the law does not compensate gravity exactly, because then no
@@ -115,7 +115,7 @@ class LeeSpong(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The largest delay T_max, from which the law computes its damping, is set to half of the
@@ -124,7 +124,7 @@ class LeeSpong(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {
             "K": gains["K"],

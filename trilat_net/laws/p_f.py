@@ -120,10 +120,11 @@ class PF(ControlLaw):
             )
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - as the other laws
-        """Explains to the user that the dominance factors of a site have no effect.
+        """Explains to the user that the dominance factors of an arm have no effect.
 
-        That is the case if the stiffness K and the force gain k_f are both zero: the site then
-        neither follows nor feels its peers.
+        Dominance factors are the weights with which an arm follows the other arms. If the
+        stiffness K and the force gain k_f are both zero, the arm neither follows nor feels
+        them.
 
         Returns:
             A sentence. Empty if one of the gains is not zero.
@@ -145,7 +146,8 @@ class PF(ControlLaw):
         Returns:
             The sentence. Empty for one master and one slave.
         """
-        if sorted(roles) == ["master", "slave"]:
+        is_one_pair = sorted(roles) == ["master", "slave"]
+        if is_one_pair:
             return ""
         sites = count_nouns(len(roles), "site")
         masters = roles.count("master")
@@ -158,12 +160,12 @@ class PF(ControlLaw):
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a scenario for this law, after its gains were tuned.
 
-        The table depends on the role of the site, because only the slave has a spring and only
+        The table depends on the role of the arm, because only the slave has a spring and only
         the master feels forces.
 
         Args:
             gains: The tuned gains by name.
-            site: The site whose table is written.
+            site: Facts about the arm for which the table is written.
         """
         if site.role == "master":
             return {

@@ -81,10 +81,10 @@ class PdD(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition of P+d on K and d. None if the law does not compensate gravity
