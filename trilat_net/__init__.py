@@ -159,9 +159,13 @@ def _is_added(name: str) -> bool:
     Args:
         name: The name.
     """
-    files = (f"{folder}/{name}{ending}" for folder in __path__ for ending in ("", ".py"))
-    if name.startswith("_") or any(map(_os.path.exists, files)):
+    folders_and_modules = [
+        f"{folder}/{name}{ending}" for folder in __path__ for ending in ("", ".py")
+    ]
+    is_module = any(map(_os.path.exists, folders_and_modules))
+    if name.startswith("_") or is_module:
         return False
+
     from .entry_points import FUNCTIONS, find_entries
 
     return name in find_entries(FUNCTIONS)
