@@ -106,7 +106,7 @@ class Authority(ControlLaw):
         """Returns the springs of this law as blocks of the linear analysis.
 
         The linear analysis considers small motions around a pose at rest. Each spring pulls the
-        arm of this site (the process of one arm) towards the arm of a user:
+        arm towards the arm of a user:
 
             tau = K sum_j alpha_j leads_j (q_j - q)
 
@@ -119,20 +119,20 @@ class Authority(ControlLaw):
         vector that peer j sends, and the row ("to", j) the vector that is sent to peer j.
 
         Args:
-            situation: The site, its peers (the other sites) and their laws.
+            situation: This arm, its peers (the other arms) and their laws.
         """
         joints = len(situation.inertia)
         form = LinearForm(joints)
         K = np.array(self.K)
         for j in situation.peers:
-            # A site with another law has no flag `leads` and is not followed.
+            # An arm with another law has no flag `leads` and is not followed.
             peer_leads = getattr(situation.laws[j], "leads", False)
-            alpha = situation.alpha[situation.site, j]  # weight with which this site follows j
+            alpha = situation.alpha[situation.site, j]  # weight with which this arm follows j
             share = alpha * float(peer_leads)
             stiffness = share * K
             form.add("tau", "q", -stiffness)
             form.add("tau", ("from", j), stiffness)
-            form.add(("to", j), "q", 1.0)  # every site sends its position
+            form.add(("to", j), "q", 1.0)  # every arm sends its position
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:

@@ -559,12 +559,16 @@ def _exponentiate(matrix: Array) -> Array:
     Args:
         matrix: The matrix, shape (n, n).
     """
-    size = float(np.abs(matrix).sum(axis=1).max())
-    halvings = max(0, math.ceil(math.log2(size)) + 1) if size > 0.0 else 0
+    # The power series converges fast for a matrix with a norm of at most 1/2. The matrix is
+    # halved as often as needed, and its exponential squared as often.
+    norm = float(np.abs(matrix).sum(axis=1).max())
+    halvings = 0
+    if norm > 0.0:
+        halvings = max(0, math.ceil(math.log2(norm)) + 1)
     scaled = matrix / 2.0**halvings
     exponential = np.eye(len(matrix))
     term = np.eye(len(matrix))
-    for n in range(1, 19):  # the norm is at most 1/2, so that the 18th term is below 1e-21
+    for n in range(1, 19):  # the 18th term is below 1e-21
         term = term @ scaled / n
         exponential = exponential + term
     for _ in range(halvings):

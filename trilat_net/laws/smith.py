@@ -129,6 +129,7 @@ class Smith(ControlLaw):
                 their number.
         """
         K = (0.0,) if self.predicts else self.K
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=K, d=self.d, known=known)
 

@@ -239,10 +239,13 @@ def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 def _find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     """Returns the energy that may still be used to move the follower in one coupling, J.
 
-    A coupling connects a leader to this arm, its follower. The known energy is the sum of three
-    parts: the energy that the leader is known to have put in, minus the energy that moved the
-    follower, plus the energy that was saved when the controller reduced the velocity. Half of
-    the initial reserve is added. The other half is kept for periods that cost more than
+    A coupling connects a leader to this arm, its follower. The known energy is
+
+        E_led + reserve / 2 - E_moved + E_yielded
+
+    E_led is the energy that the leader is known to have put in, E_moved the energy that moved
+    the follower, and E_yielded the energy that was saved when the controller reduced the
+    velocity. The other half of the initial reserve is kept for periods that cost more than
     predicted.
 
     Args:
