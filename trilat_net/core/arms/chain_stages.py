@@ -484,6 +484,8 @@ def advance_arm(
     n = chain.shape[0]
     begin_stages(s, n)
     half = 0.5 * h_s
+    # Four evaluations: at the beginning, twice in the middle, and at the end of the period. The
+    # evaluations in the middle count twice.
     _put_acceleration(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     use_stage(s, n, 1.0, half)
     _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)

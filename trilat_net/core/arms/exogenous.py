@@ -616,7 +616,8 @@ def source_torque(
         The torques on the two joints, N m, and the force of the wall, N. The force is 0 if the
         environment is not a wall.
     """
-    if not actor.start_s <= t_s < actor.end_s:
+    is_active = actor.start_s <= t_s < actor.end_s
+    if not is_active:
         return 0.0, 0.0, 0.0
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         torque = _spring_force(actor, t_s, q, qd)
@@ -661,7 +662,8 @@ def add_source_torque(
         lengths: Lengths of the two links, m.
         actor: Parameters of the operator or environment.
         table: Recorded torques and other numbers of all operators and environments.
-        sampled: 1 to add only a sampled actor, 0 to add only others.
+        sampled: 1 to add the torque only if it is constant during a control period (sampled). 0
+            to add it only if it acts continuously.
 
     Returns:
         The new total. It is `total` if the actor is not of the requested sort.

@@ -157,9 +157,10 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 
 @leaf
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
-    """Returns a row of a matrix times the transpose of a matrix with the rows a, b and c.
+    """Returns the scalar products of a vector with the vectors a, b and c.
 
-    Its three numbers are the scalar products of `row` with a, b and c.
+    This is a row of the product of a matrix with the transpose of the matrix with the rows a, b
+    and c.
     """
     x = row[0]
     y = row[1]
@@ -176,7 +177,7 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
 
     All three are rotation vectors: the direction is the axis, the length the angle in rad. With
     the rotation matrices T of `turn` and R of `vector`, the result is the rotation vector of
-    T R. `relative_rotation` returns that of T X' for a matrix X. Therefore X is the inverse R'.
+    T R.
 
     Args:
         turn: Rotation vector of the second rotation.
@@ -185,6 +186,7 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
     second_matrix = rotation_matrix(turn)
     inverse_vector = scale(-1.0, vector)
     first_matrix_inverse = rotation_matrix(inverse_vector)
+    # `relative_rotation` transposes its second matrix, and the transpose of R' is R.
     return relative_rotation(second_matrix, first_matrix_inverse)
 
 

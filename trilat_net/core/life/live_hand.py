@@ -207,8 +207,8 @@ class HandInForce(NamedTuple):
             vector: Field `hand` of the record. It contains the numbers of all fields of this
                 class, in their order.
         """
-        size = (len(vector) - 3) // 2
         grip, number, source, *numbers = vector
+        size = len(numbers) // 2  # of the target and of its velocity
         return cls(
             grip=grip,
             number=int(number),
@@ -627,9 +627,10 @@ def _aim(
 
 
 def _release(memory: HandMemory, number: int) -> HandMemory:
-    """Returns the state after the holder has released the arm: nobody holds it, the grip fades.
+    """Returns the state after a person or program has let go of the arm.
 
-    The grip, the target and its velocity continue, so that the force fades without a jump.
+    Nobody holds the arm, but the grip, the target and its velocity continue, so that the force
+    fades without a jump.
 
     Args:
         memory: State before the release.
@@ -641,23 +642,24 @@ def _release(memory: HandMemory, number: int) -> HandMemory:
 
 
 def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
-    """Returns the velocity of the target while its grip fades, after the hand let go.
+    """Returns the velocity of the target to which an arm is pulled, after the person let go.
 
-    The speed falls with the largest deceleration that `rules` allow, in the direction of
-    motion, until the target stands still.
+    The force fades meanwhile. The speed of the target falls with the largest deceleration that
+    `rules` allow, until the target stands still.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.
-        memory: State of the hand, with the present velocity of the target.
+        memory: State of the pull, with the present velocity of the target.
 
     Returns:
         The velocity, one number per coordinate, in the unit of the target per second.
     """
     speed = math.sqrt(sum(v * v for v in memory.rate))
-    slower = speed - rules.acceleration_limit / rules.rate_hz
-    if slower <= 0.0:
+    largest_change = rules.acceleration_limit / rules.rate_hz
+    next_speed = speed - largest_change
+    if next_speed <= 0.0:
         return (0.0,) * len(memory.rate)
-    return tuple(slower / speed * v for v in memory.rate)
+    return tuple(next_speed / speed * v for v in memory.rate)
 
 
 def _find_limited_rate(

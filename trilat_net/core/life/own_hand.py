@@ -243,9 +243,9 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Schedules a decision of the program, which acts after the delay of the program.
+        """Checks a decision of the program, and schedules it after the program's reaction time.
 
-        A decision is ignored if it is based on an older view than an earlier decision.
+        A decision is ignored if it is based on an older view of the arm than an earlier one.
 
         Args:
             k: Control period whose view of the arm the decision is based on.
@@ -256,10 +256,11 @@ class OwnHand:
             ValueError: The goal has the wrong number of coordinates, is not finite, or is too
                 large.
         """
+        holds_arm = goal is not None
         numbers: tuple[float, ...] = ()
         if goal is not None:
             numbers = tuple(float(number) for number in goal)
-        if goal is not None and len(numbers) != self._rules.size:
+        if holds_arm and len(numbers) != self._rules.size:
             count = count_nouns(len(numbers), "number")
             raise ValueError(f"the action has {count}, not {self._rules.size}")
         if not all(map(math.isfinite, numbers)):
@@ -270,11 +271,12 @@ class OwnHand:
             raise ValueError(
                 f"the action has a norm of {norm:g}, but at most {largest_norm:g} is accepted"
             )
-        if k <= self._newest:
+        is_outdated = k <= self._newest
+        if is_outdated:
             return
 
         self._newest = k
-        self._schedule(k, k + self.delay_ticks, numbers, grip=goal is not None)
+        self._schedule(k, k + self.delay_ticks, numbers, grip=holds_arm)
 
     def release(self, k: int) -> None:
         """Makes the program release the arm in control period k.
@@ -312,9 +314,14 @@ class OwnHand:
         Returns:
             The action in this period and the state for the next period, see `advance_hand`.
         """
+        # The commands whose delay has passed, in order.
         commands = []
-        while self._due and self._due[0][0] <= k:
-            commands.append(self._due.popleft()[1])
+        while self._due:
+            due, command = self._due[0]
+            if due > k:
+                break
+            self._due.popleft()
+            commands.append(command)
         step = advance_hand(
             rules=self._rules,
             memory=self._memory,

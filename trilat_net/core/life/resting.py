@@ -114,11 +114,12 @@ def rests_by_law(site: SiteRow) -> bool:
     - The law computed a number that is not finite.
     - The arm is too fast, see `_is_fast`.
     """
-    holds = site.law != _USER or site.holds != 0
-    learns_in_task = site.task != 0 and site.law != _KNOWN
-    failed = site.reason == _NOT_FINITE
-    usable = holds and not learns_in_task and not failed
-    return bool(usable and not _is_fast(site))
+    is_declared = site.law != _USER or site.holds != 0
+    is_unsuitable_in_task = site.task != 0 and site.law != _KNOWN
+    has_failed = site.reason == _NOT_FINITE
+    is_usable = is_declared and not is_unsuitable_in_task and not has_failed
+    # The costly condition comes last.
+    return bool(is_usable and not _is_fast(site))
 
 
 @leaf

@@ -291,7 +291,7 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
 @leaf
 def _find_fault(site: SiteRow) -> int:
-    """Returns the reason for a fault in the arm's motion, or -1 if there is no fault.
+    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is none.
 
     A fault is a number that is not finite, an angle beyond its limits, or a speed above its
     limit.
@@ -411,12 +411,12 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode of a site if needed, and computes its reference for the mode.
+    """Decides whether an arm waits, follows, comes to rest or stops, and computes its goal.
 
-    A site is the process that runs the arm, and the reference is the position that the arm
-    follows. The modes and their changes are explained at the top of this module. The mode
-    changes by an order of a person or of the site itself, by a fault of the arm, or because
-    peers (other arms) fall silent or are heard again.
+    What the arm does is called its mode, for example RUN while it follows the other arms, its
+    peers. The mode changes by an order of a person or of the arm's own control process (site),
+    by a fault of the arm, or because peers fall silent or are heard again. The goal is called
+    the reference, the position that the arm follows.
 
     Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms' positions
     and its derivative. After the call, they contain the reference: this mean in the mode RUN,

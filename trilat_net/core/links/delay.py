@@ -271,11 +271,12 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 def next_ar1_value(
     key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
 ) -> float:
-    """Returns the next number of a random sequence whose neighbours are correlated.
+    """Returns the next number of a random sequence in which neighbours are correlated.
 
         x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
 
-    This is an AR(1) sequence. Each of its numbers has the mean 0 and the deviation 1.
+    Delays that vary slowly from message to message follow such an AR(1) sequence. Each of its
+    numbers has the mean 0 and the deviation 1.
 
     Args:
         key: Key of the link, from which all its random numbers follow.

@@ -111,11 +111,10 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if the simulation can start at once, because its code is compiled.
+    """Returns True if the simulation can start at once, because its code was compiled before.
 
-    The stored code must be of the present version of the sources. Only the code of
-    `kernel.site_tick` is looked for. It is compiled last, so the other functions exist if it
-    does.
+    The stored code must be of the present version of the sources. Only the function
+    `kernel.site_tick` is looked for. It is compiled last, so if it is stored, all others are.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -676,29 +675,41 @@ class _Leaf(CPUDispatcher):
         """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
-            known: Any = self.overloads.get(argument_types)
+            compiled: Any = self.overloads.get(argument_types)
             is_called_from_python = _LeafCompiler.depth == 0
             if is_called_from_python:
-                if known is not None and getattr(known.library, "is_inner", False):
+                if compiled is not None and getattr(compiled.library, "is_inner", False):
                     # Python cannot call LLVM code. Without this entry, Numba compiles again.
                     del self.overloads[argument_types]
                 return super().compile(signature)
 
             # A compiled caller can use machine code and LLVM code alike.
-            if known is None:
-                # Rows in lanes are defined outside of the core, whose hash names the cache.
-                is_stored = not any(map(_is_in_lanes, argument_types))
-                if is_stored:
-                    known = self._cache.load_inner(argument_types, self.targetctx)
-                if known is None:
-                    # Report the compilation, as Numba's own method does.
-                    data = {"dispatcher": self, "args": argument_types}
-                    with event.trigger_event("numba:compile", data=data):
-                        known = self._compiler.compile(argument_types, return_type)
-                    if is_stored:
-                        self._cache.save_inner(argument_types, known)
-                self.add_overload(known)
-            return known.entry_point
+            if compiled is None:
+                compiled = self._load_or_compile_inner(argument_types, return_type)
+                self.add_overload(compiled)
+            return compiled.entry_point
+
+    def _load_or_compile_inner(self, argument_types: Any, return_type: Any) -> Any:
+        """Returns the function as LLVM code, which becomes a part of a compiled caller.
+
+        The code is loaded from the cache on disk if it is there. Otherwise the function is
+        compiled, and its code is stored.
+        """
+        # The types of several runs side by side (lanes) are defined outside of the core, and
+        # the name of the cache directory contains a hash of the core only.
+        is_stored = not any(map(_is_in_lanes, argument_types))
+        if is_stored:
+            loaded = self._cache.load_inner(argument_types, self.targetctx)
+            if loaded is not None:
+                return loaded
+
+        # Report the compilation, as Numba's own method does.
+        data = {"dispatcher": self, "args": argument_types}
+        with event.trigger_event("numba:compile", data=data):
+            compiled = self._compiler.compile(argument_types, return_type)
+        if is_stored:
+            self._cache.save_inner(argument_types, compiled)
+        return compiled
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
@@ -778,9 +789,10 @@ def _make_unstored(function: Callable[..., Any]) -> Any:
 
 
 def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
-    """Returns the address of a `lane_leaf` function, and compiles the function if needed.
+    """Returns the address of a function that computes several runs at once (`lane_leaf`).
 
-    The code is not stored on disk if the attribute `is_stored` of some type is False.
+    Compiled code calls the function by its address. It is compiled if needed. The code is not
+    stored on disk if the attribute `is_stored` of some type is False.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -796,7 +808,9 @@ def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, .
 
 
 def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
-    """Returns True if a `lane_leaf` function was compiled and stored on disk before.
+    """Returns True if the code of a function for several runs at once is on disk.
+
+    If not, its first use takes long, because it has to be compiled.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -811,7 +825,9 @@ def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any,
 
 
 def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
-    """Returns the machine code of a `lane_leaf` function as text, for tests.
+    """Returns the machine code of a function for several runs at once, as text.
+
+    A test checks that it contains vector instructions.
 
     Args:
         function: A function with the decorator `lane_leaf`.

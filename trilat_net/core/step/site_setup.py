@@ -142,11 +142,10 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains in the form in which the state arrays store them.
+        """Returns the gains by the names of the fields in which the state of an arm holds them.
 
-        Returns:
-            By name: "damping", "integral" and "deceleration". The integral gain is the damping
-            divided by 4 `time_s`, in N m/rad.
+        They are "damping", "integral" and "deceleration". The integral gain is the damping
+        divided by 4 `time_s`, in N m/rad.
         """
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {
@@ -165,7 +164,8 @@ class RestGains(NamedTuple):
             The time in s for each set of n velocities, shape (...). If nothing else slows down
             the joints, their reference has stopped after this time.
         """
-        slowest_s = (np.abs(qd) / self.deceleration).max(axis=-1)
+        stop_times_s = np.abs(qd) / self.deceleration
+        slowest_s = stop_times_s.max(axis=-1)  # of the joints of an arm
         duration_s: Array = np.maximum(LEAST_STOP_S, slowest_s)
         return duration_s
 

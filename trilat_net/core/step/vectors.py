@@ -77,10 +77,10 @@ def put_five(a: Any, values: Five) -> None:
 
 @leaf
 def choose(condition: bool, if_true: float, if_false: float) -> float:
-    """Returns one of two numbers. Both are computed, so that compiled code has no branch.
+    """Returns one of two numbers, without a branch in the compiled code.
 
-    Functions with `choose` can also be compiled for numbers of several runs, see
-    `execution/lanes`.
+    Both numbers are computed. Functions with `choose` in place of `if` can also be compiled for
+    the numbers of several runs side by side, see `execution/lanes`.
 
     Args:
         condition: The condition.
