@@ -172,15 +172,11 @@ def _is_added(name: str) -> bool:
 
 
 def _import_name(name: str) -> _Any:
-    """Imports the object of a public name.
+    """Imports the public function or class of a name, for example `trilat_net.simulate`.
 
-    Args:
-        name: The name.
-
-    Returns:
-        The object. If a package that it needs is missing, a function that raises UsageError
-        when it is called. Raising the error here would be wrong, because programs look up names
-        without using them (`hasattr`, `dir`, completion in an editor).
+    If a package that it needs is missing, the result is a function that raises UsageError when
+    it is called. Raising the error here would be wrong, because programs look up names without
+    using them (`hasattr`, `dir`, completion in an editor).
     """
     from .errors import UsageError
 
@@ -199,11 +195,11 @@ def _import_name(name: str) -> _Any:
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:
-    """Returns a function that raises UsageError, in place of an unavailable object.
+    """Returns a function that only raises UsageError, in place of one that cannot be imported.
 
     Args:
-        name: Public name of the object.
-        problem: Text of the error, which names the package.
+        name: Public name of the function or class that cannot be imported.
+        problem: Text of the error, which names the missing package.
     """
     from .errors import UsageError
 

@@ -353,7 +353,7 @@ def _make_next_folder(name: str) -> Path:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            continue
+            continue  # an earlier result has this number
         except OSError as error:
             raise describe_write_error(folder, error) from None
         return folder
@@ -381,7 +381,8 @@ def refuse_existing(
     """
     refuse_link(path)
     is_empty_folder = manifest and path.is_dir() and not any(path.iterdir())
-    if os.path.lexists(path) and not is_empty_folder:
+    is_taken = os.path.lexists(path) and not is_empty_folder
+    if is_taken:
         is_same_kind = (path / manifest).is_file() if manifest else path.is_file()
         if not is_same_kind:
             kind = "an exported folder" if manifest else "a file"
@@ -535,10 +536,10 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Returns the error of a failed write, for the caller to raise.
+    """Converts an error of the system in writing a file into one that tells users what to do.
 
     A full disk needs another remedy than a wrong path. Therefore the two cases have different
-    errors.
+    errors. The caller raises the result.
 
     Args:
         path: The file.
