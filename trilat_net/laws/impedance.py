@@ -502,6 +502,7 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     if selections is None:
         return "no bound is known for walls, because of the hands at the masters"
     factors = situation.alpha[slave]
+    # One bound for each combination of hands at the masters; the smallest holds for all.
     stiffnesses = [
         _find_stiffest_wall(situation.laws, factors, slave, selection)
         for selection in selections

@@ -484,6 +484,7 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
+    # Row 0 holds the weights before the first change, and stays first.
     starts_ns = ramps[1:count, 0]
     index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
     later_ramps = ramps[index:count].copy()
@@ -506,6 +507,7 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
     count = int(link.models)
+    # Row 0 is the model before the first change, and stays first.
     starts_ns = models["from_ns"][1:count]
     index = 1 + int(np.searchsorted(starts_ns, model.from_ns, side="right"))
     later_models = models[index:count].copy()
