@@ -5,7 +5,7 @@ Without bounds, an estimate may drift as long as the errors are not zero. Here t
 lowest and a highest value for each parameter (together a box), and a projection keeps the
 estimate between them. The torque is computed as in `Adaptive`, by Eq. (13) of the paper.
 
-The compiled control loop computes this law (`core.control.project_estimate`).
+The compiled control loop computes this law (`core.step.control.project_estimate`).
 `AdaptiveBox.advance_estimate` states the projection in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
 """

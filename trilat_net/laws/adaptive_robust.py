@@ -4,9 +4,9 @@ The law estimates the dynamic parameters of its arm within a box, as `AdaptiveBo
 additional torque opposes what no value of these parameters explains, such as friction or the
 torque of an operator. It never exceeds a bound that the user states.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.robust_torque`). `AdaptiveRobust.compute_torque` states the same law in plain
-Python, and `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
+The compiled control loop computes this law (`core.step.control.robust_torque`).
+`AdaptiveRobust.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from collections.abc import Mapping

@@ -4,7 +4,7 @@ The law PD+d couples an arm by a spring (P) and a damper (D) to the arms that it
 second damper (d) brakes the arm itself. Its damping is computed from the stiffness of the
 spring and the largest delay. Therefore the user states a delay instead of a damping.
 
-The compiled control loop computes this law (`core.control.damped_torque`).
+The compiled control loop computes this law (`core.step.control.damped_torque`).
 `LeeSpong.compute_torque` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """

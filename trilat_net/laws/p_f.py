@@ -5,8 +5,8 @@ pulled towards the master by a spring. The torque that the environment exerts on
 sent back and added to the master's torque. Both arms are damped and compensate their gravity
 torque, which is computed from known masses.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.damped_torque`). `PF.compute_torque` states the same law in plain Python, and
+The compiled control loop computes this law (`core.step.control.damped_torque`).
+`PF.compute_torque` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
