@@ -98,7 +98,8 @@ class PushGrowth(NamedTuple):
         ended_s: Time at which the twin ended before the run, in s, because the difference died
             down to the rounding errors or the twin diverged. None if the twin did not end
             early.
-        leads: True if the difference is largest at this joint at the end.
+        leads: True if the difference is largest at this joint at the end, or grows also when
+            all joints are taken together.
     """
 
     push: Push
@@ -691,6 +692,7 @@ def _judge_worst_joint(
     """
     worst = _judge_push(path, amplitude, joints, part, joint_names)
     leading_joint = worst.joint
+    grows_together = worst.trend is EnvelopeTrend.GROWS
     if len(joints) == 1 or worst.ended_s is not None:
         return worst
     for joint in joints:
@@ -704,7 +706,7 @@ def _judge_worst_joint(
         growth = _judge_push(path, joint_amplitude, [joint], part, joint_names)
         stays = growth.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.GROWS)
         if stays and _rank_badness(growth) > _rank_badness(worst):
-            leads = growth.joint == leading_joint
+            leads = grows_together or growth.joint == leading_joint
             worst = growth._replace(leads=leads)
     return worst
 
