@@ -1169,6 +1169,7 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParame
     regressors = stack_regressors(arm, 4 * LINK_PARAMETERS)
     learnt_columns = regressors[:, list(learnt)]
     learnt_indices = np.flatnonzero(learnt)
+
     matrix_norm = float(np.linalg.norm(learnt_columns))
     root_of_columns = np.sqrt(learnt_columns.shape[1])
     least_norm = DEPENDENT_SHARE * matrix_norm / root_of_columns
@@ -1187,6 +1188,7 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParame
     independent_columns = learnt_columns[:, independent]
     factors = np.linalg.lstsq(independent_columns, learnt_columns, rcond=None)[0]
     contributes = np.abs(factors) > DEPENDENT_SHARE
+
     parameter_indices = learnt_indices[independent]
     base_count = len(independent)
     combination = np.zeros((base_count, len(learnt)))

@@ -561,7 +561,7 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
     numbers = np.asarray(values, dtype=np.float64)
     if not numbers.size:
         return None
-    percentages = (50.0, 95.0, 99.0, 0.0, 100.0)
+    percentages = (50.0, 95.0, 99.0, 0.0, 100.0)  # the last two are the extremes
     percentiles = np.percentile(numbers, percentages)
     p50, p95, p99, low, high = percentiles.tolist()
     return ValueStatistics(

@@ -643,6 +643,7 @@ class _GainSearch:
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
+                """Returns the rate at which small motions grow with the gain k, in 1/s."""
                 law = self.build_law(math.exp(log_k))
                 root = self.find_root(law, pose, loop, sampled=sampled)
                 return root.s.real

@@ -572,6 +572,7 @@ def _weigh_site(
     weight_after_step = weight[1:]
 
     def weigh(increment: Increment) -> Array:
+        """Returns the sum over time of an energy, times the weight of the site."""
         at_start = weight_at_start * increment.left
         at_end = weight_at_end * (increment.right + increment.jump)
         return _accumulate(at_start + at_end)

@@ -721,10 +721,12 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         right = right + half_alpha_right * squared_right
 
     def damping_power(r: Array) -> Array:
+        """Returns the power that the damping of the control law takes, in W."""
         torque = c.Kp * r + c.robust_torque(r)
         return _dot_rows(r, torque)
 
     def friction_power(r: Array, qd: Array) -> Array:
+        """Returns the power that friction takes beyond what the law compensates, in W."""
         friction = c.arm.friction(qd)
         torque = friction - c.arm.friction(qd - r)
         return _dot_rows(r, torque)
@@ -996,6 +998,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
+        """Returns the power at given motions, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 

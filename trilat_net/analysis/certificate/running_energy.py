@@ -402,6 +402,7 @@ class RunningEnergy:
             window = self._windows[site]
             records[site] = window.rows(first, last)
             oldest_used[site] = first
+
         for site_records in records.values():
             for peer, used in site_records.used.items():
                 least_used = int(used.min())

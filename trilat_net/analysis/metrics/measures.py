@@ -278,6 +278,7 @@ def measures(
     """
 
     def declare(measure: _DeclaredMeasuring) -> _DeclaredMeasuring:
+        """Registers a function, unless one of its quantities is registered already."""
         definitions = {
             quantity.key: declared for declared in _MEASURES for quantity in declared.quantities
         }

@@ -157,6 +157,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
         return unavailable(ENERGY, "no two records in a row", of="site")
 
     def accumulate(work: Array) -> Array:
+        """Returns the sum of work over time. Periods without records count as zero."""
         known_work = np.where(known, work, 0.0)
         return np.cumsum(known_work)
 

@@ -629,7 +629,9 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
     """Computes the rightmost characteristic roots of a loop with delays, in continuous time.
 
-    The loop is stable if all roots have a negative real part.
+    The loop is stable if all roots have a negative real part. The order of the discretisation
+    that supplies the guesses is doubled, until the roots of two orders agree or the matrix is
+    too large.
 
     Args:
         loop: The loop.

@@ -73,6 +73,7 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     end_s = scenario.duration_s
 
     def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
+        """Leaves out what never rests, and lets springs of the original end stay for ever."""
         extended = []
         for actor in actors:
             starts_later = getattr(actor, "start_s", 0.0) > end_s

@@ -182,6 +182,9 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
     """Returns the matrices of an arm over a tick in which the torque is held.
 
+    The controller computes its torque once per tick, but the arm moves all the time. The free
+    arm moves by its own dynamics, and by environments that act continuously.
+
     Args:
         jacobian: Derivatives of the site's rates.
         h_s: Length of a tick, in s.

@@ -148,6 +148,7 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
+        """Marks the steps between neighbouring frequencies that must be divided."""
         size = np.linalg.norm(Y, axis=(1, 2))
         larger_size = np.maximum(size[1:], size[:-1])
         reference = np.maximum(larger_size, 1e-300)
@@ -239,6 +240,7 @@ def find_minima(
         return tolerance(w) if tolerance is not None else np.zeros(len(w))
 
     def evaluate(w: Array) -> Array:
+        """Returns the curve and its rounding error at frequencies, shape (F, 2)."""
         values = curve(w)
         rounding = find_rounding(w)
         return np.stack([values, rounding], axis=1)

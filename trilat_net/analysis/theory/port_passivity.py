@@ -163,6 +163,7 @@ def check_against_hands(
         return None
 
     def find_least(w: Array) -> Array:
+        """Returns the least eigenvalue of Z + Z^H + 2 D over all choices of operators."""
         Y = response(w)
         Z = np.linalg.inv(Y).astype(np.complex128)
         Z += _conjugate_transpose(Z)
@@ -185,6 +186,7 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
+        """Returns the rounding error of these eigenvalues."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
@@ -284,6 +286,7 @@ def check_passivity(
     """
 
     def evaluate_weighted(w: Array) -> Complex:
+        """Returns the response, with the weights of the ports if there are any."""
         Y = response(w)
         return Y if weights is None else weight_response(Y, weights)
 
@@ -292,6 +295,7 @@ def check_passivity(
         return find_least_eigenvalue(weighted)
 
     def find_tolerance(w: Array) -> Array:
+        """Returns the rounding error of the least eigenvalue."""
         Y = response(w)
         norm = _find_frobenius_norm(Y)
         return EIGENVALUE_ROUNDING * norm

@@ -1200,6 +1200,7 @@ def find_criterion_edge(
     from scipy.optimize import brentq
 
     def excess(value: float) -> float:
+        """Returns by how much a value satisfies the condition; negative if it does not."""
         evaluated = criterion(value)
         if evaluated is None:
             raise ScenarioError("no criterion covers it")
@@ -1400,6 +1401,7 @@ def _spread_line(
         return None
 
     def spread_rows(excess: Array) -> Array:
+        """Interpolates each column at the y values of the map."""
         columns = [np.interp(plane.y.values, y.values, column) for column in excess.T]
         return np.array(columns).T
 

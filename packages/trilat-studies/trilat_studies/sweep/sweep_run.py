@@ -652,6 +652,7 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
+        """Yields the rows of all cells, and counts why runs were computed alone."""
         for runs in iterate_cells(plan, done):
             reasons.update(run.alone for run in runs if run.alone)
             yield from build_cell_rows(plan, runs)
