@@ -392,7 +392,14 @@ def _solve_for_root(
 
 
 def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
-    """Returns the smallest mu of Delta(s) v = mu Delta'(s) v.
+    """Computes by how much Newton's method changes a guess s of a root.
+
+    The step is the eigenvalue mu of smallest modulus of Delta(s) v = mu Delta'(s) v. The next
+    guess is s - mu.
+
+    Args:
+        pencil: Matrices of the loop.
+        s: The guess, in 1/s.
 
     Returns:
         The step. None if there is no finite mu.
@@ -422,9 +429,13 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
 def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
     """Returns the multiplicity of a root, and the participation of each state in its mode.
 
-    Participation is the modulus of the diagonal of the residue of Delta(s)^-1, which is
-    V (W' Delta'(s) V)^-1 W' with the null vectors V and W of Delta(s). It does not depend on
-    the units of the states.
+    Participation is the modulus of the diagonal of the residue of Delta(s)^-1, which is V (W'
+    Delta'(s) V)^-1 W' with the null vectors V and W of Delta(s). It does not depend on the
+    units of the states.
+
+    Args:
+        pencil: Matrices of the loop.
+        s: The root, in 1/s.
 
     Returns:
         The number of null vectors, and the participation, shape (n,). None if s is not a root.
@@ -562,7 +573,9 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
     """Computes the rightmost characteristic roots of a loop with delays, in continuous time.
 
-    The loop is stable if all roots have a negative real part.
+    The loop is stable if all roots have a negative real part. The order of the discretisation
+    that supplies the guesses is doubled, until the roots of two orders agree or the matrix is
+    too large.
 
     Args:
         loop: The loop.
@@ -603,6 +616,9 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
     """Returns guesses of the nonzero roots, by falling real part.
 
+    They are eigenvalues of the discretised loop, of which the smallest are left out: these
+    approximate the roots that are zero by structure.
+
     Args:
         pencil: Matrices of the loop.
         order: Order of the discretisation. 0 for a loop without delays.
@@ -641,7 +657,14 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
 
 
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
-    """Returns True if every root is close to a root of the previous order."""
+    """Returns True if every root is close to a root of the previous order.
+
+    The order of the discretisation is doubled until two successive results agree.
+
+    Args:
+        previous: Roots from the previous order.
+        roots: Roots from this order.
+    """
     if len(roots) < len(previous):
         return False
     for root in roots:

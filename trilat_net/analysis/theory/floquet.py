@@ -188,6 +188,9 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
     """Returns the matrices of an arm over a tick in which the torque is held.
 
+    The controller computes its torque once per tick, but the arm moves all the time. The free
+    arm moves by its own dynamics, and by environments that act continuously.
+
     Args:
         jacobian: Derivatives of the site's rates.
         h_s: Length of a tick, in s.
@@ -386,7 +389,16 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
 
 
 class _TickRun(NamedTuple):
-    """Consecutive ticks of one site that depend on known samples only."""
+    """Consecutive ticks of one site whose used samples have all been computed before the first.
+
+    The received effects of such ticks are computed in one array operation, instead of tick by
+    tick.
+
+    Attributes:
+        site: Index of the site.
+        first: Number of the first tick, counted from the start of the span.
+        ticks: Number of ticks.
+    """
 
     site: int
     first: int
@@ -410,7 +422,11 @@ def _plan_parts(
     used: Mapping[tuple[int, int], IntArray],
     count: int,
 ) -> list[_SpanPart]:
-    """Returns an order of all ticks of a span, in parts.
+    """Plans in which order the ticks of all sites are computed, and where the span is divided.
+
+    A tick can be computed only after all samples that it uses. The plan collects as many
+    consecutive ticks of a site as possible, because their effects are then computed together.
+    After each part of the span the columns are scaled, before they become too large.
 
     Args:
         ticks: Number of ticks of each site.
@@ -432,10 +448,11 @@ def _plan_parts(
     parts = []
     for n in range(1, count + 1):
         runs = []
-        # rounded up
+        # last tick of each site in this part, rounded up
         stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
+                # as far as the peers' samples suffice that have been computed so far
                 known_until = [computable[i, j][done[j]] for j in peers[i]]
                 until = min([stop, *known_until])
                 first = done[i]
@@ -447,7 +464,7 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """The effect of one peer on a site.
+    """The effect of one peer on a site, and which of its samples the site uses at each tick.
 
     Attributes:
         peer: Index of the peer.
@@ -474,12 +491,14 @@ class _Tracks(NamedTuple):
 
 
 class _SpanMap:
-    """The linear loop over a span of time, as an operator on columns.
+    """The linear map of small motions from the start of a span of time to its end.
 
     The sites act on each other by few numbers only. The sent values of a site are r_i
     combinations of its n_i states, from which the effects on all other sites follow. A column
-    contains, for each site, its sent values of the last ticks, as far back as a peer uses them,
-    and then its present states.
+    contains one motion: for each site, its sent values of the last ticks, as far back as a peer
+    uses them, and then its present states. The matrix of the map would be very large, because
+    it covers the past of all sites. It is therefore never built: the map is applied to columns
+    by computing every tick.
 
     Attributes:
         neutral: Constant motions, orthonormal, shape (size, zeros).
@@ -488,6 +507,7 @@ class _SpanMap:
     """
 
     def __init__(self, loop: CoupledTicks, rates_hz: Sequence[int], uses: SamplesInUse) -> None:
+
         sites = range(len(rates_hz))
         self._states = [np.flatnonzero(loop.owners == i) for i in sites]
         self._P = []
@@ -543,7 +563,14 @@ class _SpanMap:
         return np.ascontiguousarray(right[acts])
 
     def _find_constant_motions(self, loop: CoupledTicks) -> Array:
-        """Returns an orthonormal basis of the motions that stay constant for any delays."""
+        """Returns an orthonormal basis of the motions that stay constant for any delays.
+
+        A shift of all arms to another common pose is an example. States X stay constant if X =
+        S X + sum_ij E_ij X, where E_ij are the effects of the sites on each other.
+
+        Args:
+            loop: Linear model of all sites over one tick.
+        """
         identity = np.eye(len(loop.names))
         static_map = identity - loop.S - sum(loop.effects.values())
         _, values, right = np.linalg.svd(static_map)
@@ -572,7 +599,11 @@ class _SpanMap:
         return np.vstack(blocks)
 
     def divide_out_constant(self, V: Array) -> Array:
-        """Returns columns less their constant motions."""
+        """Returns columns less their constant motions, whose multipliers are exactly 1.
+
+        Args:
+            V: Columns, shape (size, columns).
+        """
         constant_part = self.neutral @ (self.neutral.T @ V)
         return V - constant_part
 
@@ -580,7 +611,7 @@ class _SpanMap:
         """Returns the tracks of each site, with its past and with room for the span.
 
         Args:
-            V: Columns with the past.
+            V: Columns with the past, shape (size, columns).
         """
         columns = V.shape[1]
         tracks = []
@@ -668,7 +699,16 @@ class _SpanMap:
             site_tracks.sent[past + stop] = sent @ site_tracks.states[stop]
 
     def _run_ticks(self, tracks: Sequence[_Tracks], run: _TickRun) -> None:
-        """Computes the states of one site over consecutive ticks, and what it sends."""
+        """Computes the states of one site over consecutive ticks, and what it sends.
+
+        The effects of the peers are known before the first of these ticks, so they are added
+        for all ticks at once. The site's own states follow tick by tick, since each depends on
+        the one before.
+
+        Args:
+            tracks: Motion of each site over the span, filled in up to the first tick.
+            run: The ticks.
+        """
         i = run.site
         end = run.first + run.ticks
         states, sent_values = tracks[i]
@@ -693,6 +733,12 @@ def _find_multipliers(
     largest_residual: float,
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Returns the largest multipliers of a span map, by the block Arnoldi method.
+
+    The method applies the map again and again, each time to the block of columns that the last
+    application added, and keeps an orthonormal basis of all columns so far. The eigenvalues of
+    the small matrix H, which is the map in this basis, approach the largest multipliers. It
+    ends when all wanted multipliers are exact, when no new direction is found, or when the
+    basis is full.
 
     Args:
         span: The map.
@@ -719,7 +765,8 @@ def _find_multipliers(
             projection = basis.T @ W
             W -= basis @ projection
             H[:, -width:] += projection
-        # the singular values of W are those of its small factor
+        # what is left of W are the directions that the basis does not contain yet; the
+        # singular values of W are those of its small factor
         directions, factor = np.linalg.qr(W)
         left, lengths, right = np.linalg.svd(factor)
         is_new = lengths > ZERO_SHARE * np.abs(H).max()
@@ -1033,7 +1080,12 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first root that equals s within `_SAME_ROOT`, or None."""
+    """Returns the index of the first known root that equals s, or None.
+
+    Args:
+        roots: The known roots.
+        s: A root, in 1/s. It may differ by `_SAME_ROOT`.
+    """
     for index, known in enumerate(roots):
         if abs(known.s - s) <= _SAME_ROOT * (1.0 + abs(s)):
             return index

@@ -431,12 +431,23 @@ def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots
 
 
 def _explain_no_roots(reason: str) -> LoopRoots:
-    """Returns a result without roots, with the reason."""
+    """Returns a result without roots, which says why they could not be computed.
+
+    Args:
+        reason: The reason, as a phrase for the user.
+    """
     return LoopRoots("", None, False, f"this rest: no roots: {reason}")
 
 
 def _end_traces(scenario: Scenario) -> Scenario:
-    """Returns a scenario in which traces that have ended at its end are constant delays."""
+    """Returns a scenario in which tables of delays that have ended are constant delays.
+
+    After the end of such a table its last delay stays in force, so the final loop has a
+    constant delay. It replaces the planned changes of the link too.
+
+    Args:
+        scenario: The scenario up to the end of the run.
+    """
     end_us = 1e6 * scenario.duration_s
     links: dict[str, LinkBase] = dict(scenario.links)
     timeline = list(scenario.timeline)
@@ -469,6 +480,9 @@ def _fix_delays(
     find_used: Callable[[int, int, Ints], Ints],
 ) -> _FixedDelays:
     """Returns a scenario with the delays that occurred in its run.
+
+    Random and measured delays cannot be predicted. For them the samples in use in the last
+    quarter of the run stand for all later ones.
 
     Args:
         scenario: The scenario up to the end of the run.
@@ -555,7 +569,12 @@ def _choose_end_state(
 
 
 def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
-    """Returns the last recorded joint angles of all sites, shape (N, n), in rad."""
+    """Returns the last recorded joint angles of all sites, shape (N, n), in rad.
+
+    Args:
+        scenario: Scenario of the run.
+        trace: The reduced data of the run.
+    """
     return pad_rows([q[-1] for q, _ in _iterate_motions(scenario, trace)])
 
 
@@ -601,7 +620,15 @@ class _SiteMotion(NamedTuple):
 
 
 def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
-    """Simulates a scenario, and returns the motion of each site."""
+    """Simulates a scenario again, and returns the motion of each site.
+
+    The run to be judged kept only reduced data and its last records. The state of an arm that
+    chatters at a wall needs all records of the last quarter. They are read in batches, so that
+    a long run does not need memory for whole records.
+
+    Args:
+        scenario: The scenario up to the end of the run.
+    """
     run = FusedRun(scenario, keep=_BATCH_RECORDS + 1)
     fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
     batches: list[list[_SiteMotion]] = [[] for _ in scenario.names]
@@ -628,13 +655,23 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
 
 
 def _has_sampled_wall(scenario: Scenario) -> bool:
-    """Returns True if the force of some environment is computed once per tick and held."""
+    """Returns True if the force of some environment is computed once per tick and held.
+
+    An arm may then chatter at the wall, and its mean pose may be off the wall although it hits
+    it in every cycle.
+
+    Args:
+        scenario: Scenario of the run.
+    """
     environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
     return any(environment.actor.sampled for environment in environments)
 
 
 def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _EndState | None:
     """Finds the deepest state of arms that chatter at a sampled wall, in the last quarter.
+
+    The mean of such a motion may be beside the wall, where the loop is another one. The deepest
+    state is inside the wall, so the wall's stiffness is part of the linearised loop.
 
     Args:
         scenario: Scenario of the run.

@@ -69,6 +69,7 @@ class ArgumentLayout:
         self.shared = shared
         self.peers = peers
         self.coordinates = m = shared or joints
+        # in the order of the attributes; index 6 are the samples of the single peers
         lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
         ends = accumulate(lengths, initial=0)
         slices = [slice(start, stop) for start, stop in pairwise(ends)]
@@ -79,6 +80,7 @@ class ArgumentLayout:
         self.qd_des = slices[4]
         self.peer_torque = slices[5]
         self.external_torque = slices[7]
+
         self.states = self.estimate.stop
         self.arguments = self.external_torque.stop
         self.inputs = slice(self.states, self.external_torque.start)
@@ -322,7 +324,15 @@ def has_estimate(site: SiteSetup) -> bool:
 
 
 def _as_columns(values: object, like: Numbers) -> Numbers:
-    """Returns values with a copy for each column of another array, shape (..., columns)."""
+    """Repeats constants, such as gains, for each column of another array.
+
+    Args:
+        values: The constants, of any shape.
+        like: Array whose trailing axes are the columns.
+
+    Returns:
+        The constants, with the trailing axes of `like` behind their own axes.
+    """
     column = np.asarray(values, dtype=np.float64)
     columns = like.shape[1:]
     column_axes = (1,) * len(columns)
@@ -348,14 +358,17 @@ def _evaluate_known_gravity_law(
     Kd = _as_columns(gains.Kd, q)
     d = _as_columns(gains.d, q)
     k_f = _as_columns(gains.k_f, q)
+
     known_parameters = np.broadcast_to(gains.known, site.theta.shape)
     theta = _as_columns(known_parameters, q)
     G = arm.gravity_torque(theta)
+
     error_damper = Kd * following.ed
     spring = K * following.e
     reflected = k_f * x[layout.peer_torque]
     pull = error_damper + spring - reflected
     pull_torque = following.to_joints(pull)
+
     damper = d * qd
     torque: Array = G - damper - pull_torque
     return torque
@@ -420,7 +433,10 @@ def _evaluate_adaptive_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """Returns True where an estimate is at a limit of its box and its rate points outward."""
+    """Returns True where an estimate is at its limit and its rate points beyond the limit.
+
+    The adaptive law then holds the estimate (projection).
+    """
     low = _as_columns(site.gains.low, estimate)
     high = _as_columns(site.gains.high, estimate)
     is_low = estimate.real <= low + SWITCHING_TOLERANCE
@@ -512,7 +528,10 @@ def _evaluate_actor(
 
 
 def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -> Numbers:
-    """Returns the effort of an operator or environment that a user wrote, components first."""
+    """Returns the torque or force of an operator or environment that a user wrote.
+
+    The components are on the first axis, as in this module.
+    """
     # models expect the components on the last axis
     positions = np.moveaxis(position, 0, -1)
     velocities = np.moveaxis(velocity, 0, -1)
@@ -557,7 +576,11 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 
 
 def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
-    """Returns True for each estimate that rests at a limit of its box, shape (P,)."""
+    """Finds estimates that rest exactly at a limit, and of which the law holds none.
+
+    The derivative of the law is one-sided there. The result is True for each such estimate,
+    shape (P,).
+    """
     layout = lay_out_arguments(site)
     gains = site.gains
     estimate = x[layout.estimate]
@@ -567,9 +590,10 @@ def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
     is_near_high = np.abs(high - estimate) < SWITCHING_TOLERANCE
     rate = evaluate_site_rates(site, x).estimate
     is_still = np.abs(rate) <= SWITCHING_TOLERANCE
-    # an estimate that would leave an open box is held by its bound
-    open_box = gains._replace(low=-np.inf, high=np.inf)
-    free_rate = evaluate_site_rates(site._replace(gains=open_box), x).estimate
+    # an estimate that would leave its range without limits is held by its limit
+    unlimited_gains = gains._replace(low=-np.inf, high=np.inf)
+    unlimited_site = site._replace(gains=unlimited_gains)
+    free_rate = evaluate_site_rates(unlimited_site, x).estimate
     is_held = _is_at_bound(site, estimate, free_rate)
     adapts = np.asarray(gains.Gamma) > 0
     switching: NDArray[np.bool_] = (is_near_low | is_near_high) & is_still & ~is_held & adapts
