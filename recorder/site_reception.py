@@ -282,6 +282,7 @@ class SiteReception:
         """
         if channel == topics.EVENT:
             return self._read_event(payload)
+
         content = self._decoders[channel](payload)
         number = number_message(channel, content.tick, self._rate_hz)
         sent_ns = content.sent_ns if channel == topics.STATE else content.t_ns
@@ -310,6 +311,7 @@ class SiteReception:
                 f"{self.name} reports {count_nouns(event.ticks, 'tick')}, but must report 0 to "
                 f"{self._ticks}",
             )
+
         # Only these two events state how many ticks the site has executed.
         stated_ticks = event.ticks if event.kind in ("join", "end") else 0
         self._check(

@@ -94,6 +94,9 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
 class SiteEnd:
     """Ends a site: publishes the result, waits for the recorders, and informs the user.
 
+    A site is the process that controls one arm. After its last control period it still has
+    messages that the log needs.
+
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.

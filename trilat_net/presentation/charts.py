@@ -94,6 +94,9 @@ class _PageCharts(NamedTuple):
 class ChartBuilder:
     """Computes the charts of the page that reports a run, from the run's log.
 
+    The numbers become tables, from which the scripts of the page draw the charts in the
+    browser.
+
     Args:
         log: Log of the run.
         twin: Log of the same run without operators, the people or programs that move the arms.

@@ -53,6 +53,8 @@ Joints = int | str | Sequence[int | str] | None
 class _Line(NamedTuple):
     """The values of one column at one site.
 
+    A panel of the figure has such a line for each site that has the column.
+
     Attributes:
         site: Name of the site.
         tick: Numbers of the ticks, shape (K,).
@@ -272,6 +274,7 @@ def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
     numbers = list(range(1, len(names) + 1))
     if joints is None:
         return numbers
+
     selected = [joints] if isinstance(joints, int | str) else list(joints)
     return [
         number
@@ -288,9 +291,11 @@ def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
     """
     if joints is None:
         return
+
     selected = [joints] if isinstance(joints, int | str) else list(joints)
     if not selected:
         raise UsageError("joints is empty; joints are numbers from 1 or names")
+
     for joint in selected:
         if not any(_number_joints(log, site, joint) for site in sites):
             names = log.scenario.arms[sites[0]].joint_names

@@ -80,6 +80,9 @@ def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
 class _Panels:
     """Collects the settings of panels, and gives each panel an identifier.
 
+    Foxglove is a viewer for data of robots. Its layout file refers to panels by their
+    identifiers.
+
     Attributes:
         settings: Settings of each panel, by its identifier.
     """
@@ -137,6 +140,7 @@ def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
     upper_area = panels.add_tabs(tabs)
     if not lower_panels:
         return upper_area
+
     lower_area = _divide("row", lower_panels, _MODES_PERCENT)
     return _divide("column", [upper_area, lower_area], _PLOTS_PERCENT)
 

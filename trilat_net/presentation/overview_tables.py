@@ -189,6 +189,7 @@ def _compose_channels(
     """
     if not channels:
         return
+
     prefix = f"/trilat/{session['session']}/" if session else ""
 
     rows = []
@@ -256,6 +257,7 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
     if not accounts:
         yield "no accounts: the recording was not finished"
         return
+
     faulty_accounts = {
         topic: account
         for topic, account in accounts.items()

@@ -913,6 +913,7 @@ class TimeFigure:
             meanings |= {interval.meaning for interval in intervals}
         if not meanings:
             return ""
+
         phrases = []
         for meaning in sorted(meanings):
             shade = " (lighter)" if meaning.mode is Mode.RETURN else ""

@@ -69,6 +69,7 @@ class MeanInterval(NamedTuple):
         count = len(known)
         if count < 2 or count < len(values):
             return None
+
         # Imported here, because the import takes long.
         from scipy.special import stdtrit
 

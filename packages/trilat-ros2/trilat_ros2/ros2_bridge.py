@@ -350,12 +350,14 @@ class SilenceNotice:
         now_ns = self._clock.monotonic_ns()
         if now_ns < self._due_ns:
             return ""
+
         self._due_ns = now_ns + NEXT_NOTICE_NS
 
         if self._has_measurement:
             return f"no further measurement on {topic}: {site} has lost its arm"
         if not self._has_message:
             return f"no message on {topic} yet: {site} waits for its arm"
+
         text = f"no measurement on {topic} yet: {site} waits for its arm"
         if self._other_joints:
             joint_names = ", ".join(names[0] for names in self._joints)
@@ -439,6 +441,7 @@ class RobotArm:
             positions = count_nouns(len(state.position), "position")
             velocities = count_nouns(len(state.velocity), "velocity")
             raise ValueError(f"has {positions} and {velocities}")
+
         q = _check_finite([state.position[index] for index in indices])
         qd = _check_finite([state.velocity[index] for index in indices])
         with self._lock:
@@ -552,6 +555,7 @@ def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
         present_names = ", ".join(state.names[:9]) or "no names"
         missing_text = ", ".join(missing_joints)
         raise ValueError(f"lacks {missing_text}; the message has {present_names}")
+
     for names in joints:
         for name in names:
             if state.names.count(name) > 1:

@@ -247,6 +247,7 @@ def log_view_command(
     needs_rerun = full or web or save
     if not needs_rerun and find_spec("rerun") is None:
         return _open_page(files)
+
     with stage_output(save, force=force) if save is not None else nullcontext() as output_path:
         open_rerun(
             files,

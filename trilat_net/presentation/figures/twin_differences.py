@@ -283,6 +283,7 @@ def _draw_rate(
     """
     if not np.isfinite(rated.rate_per_s) or rated.trend is EnvelopeTrend.UNDECIDED:
         return
+
     from_s = pushed.growth.from_s
     to_s = pushed.growth.to_s
     if rated.ended_s is not None:

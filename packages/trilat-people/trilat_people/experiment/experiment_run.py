@@ -420,11 +420,13 @@ class Experiment(Result):
                 "text": note.text,
             }
             events.append(event)
+
         tables = {
             TRIALS_FILE: self.to_rows(),
             "questionnaires.csv": self.list_answers(),
             "events.csv": events,
         }
+
         for name, rows in tables.items():
             if rows or name == TRIALS_FILE:
                 text = encode_csv(rows)

@@ -480,6 +480,7 @@ class ExperimentPlan(Result):
 
         if training is not None and starts_retention:
             return training.rest_s
+
         starts_later_block = planned.trial == 1 and planned.block > 1
         if starts_later_block:
             return self.protocol.rest_s
@@ -773,6 +774,7 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
         raise ScenarioError(
             "the slave has no wall to press against", path=f"sites.{slave}.environment"
         )
+
     user_shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
     needs_shares = protocol.training is not None or protocol.task.needs_pair
     if needs_shares and min(user_shares) <= 0.0:

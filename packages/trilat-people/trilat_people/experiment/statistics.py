@@ -209,6 +209,7 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
             interval=None,
             bootstrap=None,
         )
+
     return ConditionMean(
         condition=condition,
         number=len(values),
@@ -640,6 +641,7 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
             f"the number of units is {number} and alpha is {alpha}: "
             "give at least two units, and an alpha between 0 and 1"
         )
+
     stats = import_scipy_stats()
     shift = abs(d_z) * math.sqrt(number)  # noncentrality of the t statistic
     freedom = number - 1

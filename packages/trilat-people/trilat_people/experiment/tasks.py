@@ -429,6 +429,7 @@ class _ReachGoal(_DwellGoal):
         errors_m = distances_m[is_handover]
         if not len(errors_m):
             return {}
+
         largest_error_m = float(errors_m.max())
         return {"error_handover_mm": 1e3 * largest_error_m}
 

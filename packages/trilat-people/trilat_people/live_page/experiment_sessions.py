@@ -102,6 +102,7 @@ class ExperimentSessions:
                     is_done = True
                 else:
                     is_done = self._run_trial(step)
+
                 if not is_done:
                     return False
             self.stage.show_end()

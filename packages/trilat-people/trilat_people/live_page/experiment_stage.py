@@ -335,6 +335,7 @@ class Stage:
 
         if self._watch is None:
             return []
+
         if view.running and self._phase == "starting":
             self._phase = "trial"
 
@@ -364,6 +365,7 @@ class Stage:
         request = self._request
         if request is None or self._clock.monotonic_ns() < request.from_ns:
             return False
+
         is_for_this_step = message.key == request.step.key
         if not is_holder or not is_for_this_step:
             return False

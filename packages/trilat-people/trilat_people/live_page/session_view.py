@@ -182,6 +182,7 @@ class SiteView:
         record = self.record
         if record is None or not self.glides or self.ended:
             return None
+
         lost_peers: Sequence[str] = ()  # peers without which the site continues
         if self.layout is not None:
             lost_peers = self.layout.list_lost_peers(record.mem, self.peers)
@@ -658,9 +659,11 @@ class SessionView:
         """
         if self.scenario is None or self.energy is None:
             return
+
         identity = (site, text)
         if identity in self._applied_changes:
             return
+
         self._applied_changes.add(identity)
 
         try:
