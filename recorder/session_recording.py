@@ -560,6 +560,8 @@ class Recording:
     def is_over(self, now_ns: int) -> bool:
         """Finds out whether the recording can end, because no site can send any more messages.
 
+        The recorder then completes the log file and ends.
+
         Args:
             now_ns: Present time on the monotonic clock, in ns.
 

@@ -610,6 +610,8 @@ class SiteReception:
     def describe_missing(self) -> str:
         """Describes for the user which messages of the site are missing.
 
+        Messages that were lost and could not be requested again leave gaps in the log.
+
         Returns:
             The number of missing messages and their first ranges, for each channel. Empty if no
             message is missing.

@@ -248,6 +248,8 @@ class ChangeServer:
     def _make_order_change(self, tick: int, order: SiteOrder) -> CoreChange:
         """Returns the change with which the order of a user takes effect in a tick.
 
+        A user stops an arm, lets it move again, or clears a fault by such an order.
+
         Args:
             tick: Number of the tick, a period of the control loop.
             order: The order: "stop", "enable" or "reset".

@@ -288,8 +288,8 @@ class SiteEnd:
     def _may_leave(self) -> bool:
         """Returns True if the site need not wait for the recorders any longer.
 
-        This is so after a second signal. After a first signal, it is so once the recorders have
-        stored everything.
+        After a first signal such as Ctrl-C, the site waits until the recorders have stored
+        everything. A second signal ends the wait at once.
         """
         interrupt = self._parts.interrupt
         is_complete = self._parts.monitor.all_stored and interrupt.is_requested()

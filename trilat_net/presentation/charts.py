@@ -236,6 +236,8 @@ class ChartBuilder:
     def _note_floor(self, unit: str) -> str:
         """Returns a note that small errors are drawn at the bottom of the logarithmic axis.
 
+        A logarithmic axis cannot show an error of zero.
+
         Args:
             unit: Unit of the errors.
 
@@ -563,6 +565,9 @@ class ChartBuilder:
 
     def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
         """Returns lines at the true values of a parameter over the whole run.
+
+        An adaptive control law estimates the parameters of the arm, and the lines show how
+        close the estimates come.
 
         Args:
             truths: The true value for each site.

@@ -237,7 +237,10 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
-    """Returns the error message for an unknown column, with the most similar name."""
+    """Returns the error message for an unknown column, with the most similar name.
+
+    The user has probably misspelled the name.
+    """
     if name in FIGURES:
         return (
             f"{name!r} is a figure and no column of the log; "
@@ -463,6 +466,8 @@ def _list_words(lines: Sequence[_Line]) -> list[str]:
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
     """Returns the values of a column as numbers to draw, shape (K,). NaN stands for no value.
+
+    Texts, such as the mode of an arm, are replaced by their positions in a list of all texts.
 
     Args:
         column: The column.

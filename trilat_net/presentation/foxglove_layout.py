@@ -228,6 +228,8 @@ def _get_list_path(channels: Ros2Channels, entity: str) -> str:
 def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
     """Adds a panel that shows the modes of all arms over time, such as "resting".
 
+    An arm that rests or holds its position does not follow the other arms.
+
     Returns:
         The identifier of the panel. Empty if there are no modes.
     """

@@ -426,10 +426,10 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
 
     A two-port is one joint of two sites, at which one operator each acts. A third site is free,
-    or its arm is clamped. The criterion fails if some passive operators make the two-port
-    unstable, which is so if Llewellyn's parameter is below 1 in some band of frequencies. A
-    line describes a failing two-port, or a group of them, and a last line counts those for
-    which the criterion holds.
+    or its arm is clamped. The criterion fails if Llewellyn's parameter is below 1 in
+    some band of frequencies. Then some passive operators make the two-port unstable. A line
+    describes a failing two-port, or a group of them, and a last line counts those for which the
+    criterion holds.
 
     Args:
         ports: Results for the joints at which the operators act.

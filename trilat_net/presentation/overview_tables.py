@@ -273,7 +273,10 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    """Yields the versions of the software and the machine that recorded the log."""
+    """Yields the versions of the software and the machine that recorded the log.
+
+    A run can be repeated bit for bit only with the same versions and the same arithmetic.
+    """
     versions: dict[str, str] = dict(session["versions"])
     version = versions.pop("trilat-net", "unknown")
     libraries = [f"{name} {library}" for name, library in versions.items()]

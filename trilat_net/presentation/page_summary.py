@@ -307,6 +307,9 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     """Returns the largest error of some sites, with their largest error in the last second.
 
+    The error e is the difference between the angles of an arm and the angles that it should
+    have.
+
     Args:
         log: Log of the run.
         sites: Names of the sites.
@@ -424,6 +427,8 @@ def render_alarms(log: Log) -> Markup:
 
 def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
     """Renders the results of the checks of the log as one line, which unfolds into a list.
+
+    The list is unfolded at first if a check has failed.
 
     Args:
         findings: Results of the checks. Some may be undecided, for example because the code of

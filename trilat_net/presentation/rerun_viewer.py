@@ -547,7 +547,11 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
 
 
 def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns Rerun's view of a plot, in which each channel has its own colors."""
+    """Returns Rerun's view of a plot, in which each channel has its own colors.
+
+    Rerun is a viewer for data of robots. A legend with too many names would cover the curves,
+    and is hidden.
+    """
     styles_by_channel = {}
     for index, curves in enumerate(plot.curves):
         styles_by_channel[curves.entity] = _style_curves(curves, first_color=2 * index)

@@ -343,6 +343,9 @@ class SilenceNotice:
     def pop(self, topic: str, site: str) -> str:
         """Returns a notice that the robot sends no measurement, if one is due. Empty otherwise.
 
+        The user learns whether the driver of the robot is silent, or sends joints with other
+        names.
+
         Args:
             topic: Name of the topic, with its leading slash.
             site: Name of the site that waits for the robot.
@@ -495,6 +498,9 @@ def _order_joints(
     safe_command: Sequence[float],
 ) -> list[int]:
     """Finds the joint of the scenario to which each joint of the controller corresponds.
+
+    A controller of a robot may list its joints in another order than the scenario, and may have
+    further joints.
 
     Args:
         joints: Names that each joint may have, in the order of the scenario.

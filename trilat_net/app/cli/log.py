@@ -263,6 +263,8 @@ def log_view_command(
 def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
     """Writes the files with which other viewers show a log, and prints how to use them.
 
+    A viewer then opens with the plots of all arms, which need not be arranged by hand.
+
     Args:
         file: The log, its first part, or an exported bag.
         foxglove: True to write a layout for Foxglove and Lichtblick.

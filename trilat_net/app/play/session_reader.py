@@ -383,6 +383,9 @@ class SessionReader:
     def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
         """Returns the time at which a message is played, in ns after the start of the session.
 
+        A message was sent at one time and arrived at a later one. The user chooses which of the
+        two counts.
+
         Args:
             item: The message.
             epoch_ns: Start of the session, in Unix time, in ns.

@@ -87,6 +87,9 @@ def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def _explain_absent_displacement(log: Log) -> str:
     """Returns the reason why a run cannot be repeated without its operators.
 
+    The displacement of an arm by its operators is the difference between a run and its
+    repetition without operators.
+
     Returns:
         The reason: there are no operators, or the code of a user's control law may not run
         here. Empty if the run can be repeated.
@@ -670,6 +673,8 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
     """Draws the path of a point in a plane, with a ring at its start and a disc at its end.
+
+    A pair of coordinates, such as an error and its rate, becomes a curve without a time axis.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

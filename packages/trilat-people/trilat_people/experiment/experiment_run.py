@@ -640,6 +640,8 @@ def run_experiment(
 def list_log_problems(experiment: Experiment) -> Iterator[str]:
     """Yields a sentence for each finished trial whose log is missing or was changed.
 
+    A log proves what happened in its trial. The journal contains the checksum of each log.
+
     Args:
         experiment: The experiment in its folder.
     """

@@ -489,6 +489,9 @@ class ExperimentPlan(Result):
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order in which each group of participants gets the conditions.
 
+        Participants get better with practice. Therefore the groups meet the conditions in
+        different orders.
+
         Returns:
             Names of the conditions in order, by the name of the group, for example {"P01-P02":
             ["near", "far"]}.

@@ -657,6 +657,8 @@ def find_least_number(
 ) -> int:
     """Returns the smallest number of participants (or pairs) that gives a test enough power.
 
+    The power is the probability that the test finds the effect if it exists.
+
     Args:
         d_z: Size of the effect: mean over standard deviation of the differences.
         wanted: Desired power, between 0 and 1.

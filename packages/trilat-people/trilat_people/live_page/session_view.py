@@ -90,6 +90,8 @@ class Tail(Generic[T]):
     def since(self, count: int, most: int) -> list[T]:
         """Lists the entries that a reader does not know yet.
 
+        A page receives in this way only the new events, and not all of them again.
+
         Args:
             count: Number of entries that had been added when the reader last asked.
             most: Largest number of entries to return. Older ones are left out.
@@ -468,6 +470,9 @@ class SessionView:
 
     def _create_sites(self, scenario: Scenario) -> None:
         """Creates the view of each site, the tables of the links and the energy of the session.
+
+        This is possible only when all sites run, because the energy is that of all arms
+        together.
 
         Args:
             scenario: Scenario of the session. All of its sites must have replied and run.
