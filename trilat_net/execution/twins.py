@@ -450,6 +450,7 @@ class _TwinRuns:
         inputs: RunInputs | None = None,
         log: Log | None = None,
     ) -> None:
+        """Creates the run and its twins before their first tick, and empty results."""
         self._log = log
         self._pushes = pushes
         self._joints = _list_joints(scenario)

@@ -256,6 +256,7 @@ class LaneEpisodes(LaneRun):
     def __init__(
         self, run: FusedRun, count: int, *, hand_site: int, hand_row: int, period_ticks: int
     ) -> None:
+        """Fills all lanes with the same run, until `load` replaces it by the first episodes."""
         super().__init__([run] * count)
         self.structure = self.find_structure(run)
         self.ticks = np.zeros(LANES, np.int64)

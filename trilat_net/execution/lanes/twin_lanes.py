@@ -68,6 +68,7 @@ class TwinLanes(LaneRun):
     def __init__(
         self, run: FusedRun, count: int, ticks: int, feed: ReplayedInputs, kept: int
     ) -> None:
+        """Copies the initial state of the run into the lanes of the run and of all twins."""
         super().__init__([run], 1 << kept.bit_length())
         self._count = count
         self._feed = feed
