@@ -1,11 +1,15 @@
-"""The walk of a reader from `certify` to the judgement, counted in the source: stays and
-returns.
+"""Two walks of a reader through the source, counted: stays, returns and climbs.
 
     python -m tests.reading_walk
 
-The reader begins in `certify` and, because it decides the exit code, in `Certificate.accepts`.
-The reader follows the calls of a body in their order, depth first, into the room `analysis`,
-and reads each function once.
+One walk leads from `certify` to the judgement. The reader begins in `certify` and, because it
+decides the exit code, in `Certificate.accepts`, and follows the calls into the folder `analysis`.
+The other walk leads from the tables of a scenario file to a complete scenario. The reader
+begins in `resolve_scenario`, and follows the calls into the modules that check and complete
+tables (`TABLE_MODULES`). Modules that read other files, word errors or check single values
+are passed by.
+
+The reader follows the calls of a body in their order, depth first, and reads each function once.
 
 - The reader passes by functions and properties that measure: their annotated results are
   numbers alone (arrays, floats, whole numbers, statements of a scenario or a log, or records
@@ -17,6 +21,7 @@ and reads each function once.
   that holds its result, stands in a condition (if, while, assert, and, or, filter of a
   comprehension). A table of functions (a tuple at the top of a module) counts as one return,
   however many functions it holds: the first that applies decides, or all are taken.
+- The reader CLIMBS to a stay that stands in its file above a stay that was read before.
 
 Methods and properties are those of the classes of an expression or of its elements, by the
 annotations of arguments, fields and results. Expressions of unknown class are not followed.
@@ -48,6 +53,12 @@ NUMBERS = {
 }
 NUMBERS |= {"tuple", "list", "dict", "Sequence", "Mapping", "Iterator", "slice", "Rows"}
 CERTIFICATE = house.ROOT / "trilat_net/analysis/certificate/stability_certificate.py"
+SCENARIO = house.ROOT / "trilat_net/scenario"
+TABLE_MODULES = [
+    SCENARIO / f"{name}.py"
+    for name in ("resolve", "written_tables", "site_tables", "control_tables", "link_tables")
+]
+"""Modules that the tables of a scenario file pass on their way to a complete scenario."""
 
 
 class Place(NamedTuple):
@@ -64,6 +75,29 @@ class Walk(NamedTuple):
 
     stays: list[Place]
     returns: list[Place]
+
+    @property
+    def climbs(self) -> list[Place]:
+        """Functions that stand in their file above a function that was read before."""
+        climbs = []
+        deepest_lines: dict[Path, int] = {}
+        for place in self.stays:
+            definition = _definition(place)
+            assert definition is not None, place
+            deepest_line = deepest_lines.get(place.module, 0)
+            if definition.lineno < deepest_line:
+                climbs.append(place)
+            deepest_lines[place.module] = max(definition.lineno, deepest_line)
+        return climbs
+
+    def print(self) -> None:
+        """Prints the functions in the order of the walk, and how many there are."""
+        for place in self.stays:
+            mark = "<- " if place in self.returns else "   "
+            print(f"{mark}{place.module.stem}: {place.name}")
+        print(
+            f"{len(self.stays)} stays, {len(self.returns)} returns, {len(self.climbs)} climbs"
+        )
 
 
 @cache
@@ -288,7 +322,8 @@ class _Body:
 
 
 def _in_rooms(definition: Place) -> bool:
-    return definition.module.relative_to(house.ROOT).parts[1] in ROOMS
+    part = definition.module.relative_to(house.ROOT).parts[1]
+    return part in ROOMS or definition.module in TABLE_MODULES
 
 
 @cache
@@ -352,8 +387,11 @@ def walk_to_judgement() -> Walk:
     return walk(Place(CERTIFICATE, "certify"), Place(CERTIFICATE, "Certificate.accepts"))
 
 
+def walk_to_scenario() -> Walk:
+    """Returns the walk from the tables of a scenario file to the complete scenario."""
+    return walk(Place(SCENARIO / "resolve.py", "resolve_scenario"))
+
+
 if __name__ == "__main__":
-    found = walk_to_judgement()
-    for one in found.stays:
-        print(f"{'<- ' if one in found.returns else '   '}{one.module.stem}: {one.name}")
-    print(f"{len(found.stays)} stays, {len(found.returns)} returns")
+    walk_to_judgement().print()
+    walk_to_scenario().print()

@@ -113,6 +113,15 @@ def test_readers_walk_straight_from_certify_to_judgement() -> None:
 
 
 @pytest.mark.push
+def test_readers_walk_straight_from_file_to_scenario() -> None:
+    """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
+    found = reading_walk.walk_to_scenario()
+    assert len(found.stays) <= 15
+    assert len(found.returns) <= 5
+    assert len(found.climbs) <= 2
+
+
+@pytest.mark.push
 def test_lines_are_no_denser_than_their_limits() -> None:
     figures = line_figures.measure_parts()
     assert set(figures) == set(LINE_LIMITS)

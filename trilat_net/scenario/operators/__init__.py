@@ -33,6 +33,7 @@ from ..key_checks import (
     field_names,
     find_count_problem,
 )
+from ..refusals import MAX_QUOTED_LENGTH
 
 
 class HeldArm(NamedTuple):
@@ -239,12 +240,10 @@ else:
     # Built at run time from the classes in this folder.
     Operator = Union[tuple(OPERATORS.values())]  # noqa: UP007
     Environment = Union[tuple(ENVIRONMENTS.values())]  # noqa: UP007
-_MAX_QUOTED_LENGTH = 60
-"""Length up to which an error message quotes a value."""
 
 
 def resolve_operators(
-    written: Any,
+    written: list[fields.TomlTable],
     kinds: Mapping[str, type[ActorBase]],
     held_arm: HeldArm,
     path: str,
@@ -267,13 +266,9 @@ def resolve_operators(
     Raises:
         ScenarioError: A table is not valid.
     """
-    if not isinstance(written, list):
-        raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)
     tables = []
     for n, entry in enumerate(written):
         entry_path = f"{path}[{n}]"
-        if not isinstance(entry, dict):
-            raise ScenarioError("must be a table", path=entry_path)
         kind = _find_kind(entry, kinds, entry_path)
         check_keys(entry, ("kind", *field_names(kind)), entry_path)
         expanded = expand_vectors(entry, kind, held_arm.counts)
@@ -359,7 +354,7 @@ def _check_values(
             expected = f"a row {POINTS_ROW_TEXT.format(**placeholders)}"
         raise ScenarioError(f"must be {expected}", path=f"{path}.{key}{index_text}")
     value = repr(entry[key])
-    quoted = f", but is {value}" if len(value) <= _MAX_QUOTED_LENGTH else ""
+    quoted = f", but is {value}" if len(value) <= MAX_QUOTED_LENGTH else ""
     raise ScenarioError(f"must be {describe_values(key)}{quoted}", path=f"{path}.{key}")
 
 
