@@ -9,7 +9,8 @@ the author may write there.
 A type may say in its own words what a value must be: `Meta(extra={"must_be": "a time in s"})`.
 
 Invariant:
-    - Every refusal of a scenario's table by msgspec is worded by `refuse`.
+    - Every refusal of a scenario's table by msgspec is worded by `refuse`, except those of
+      operators and environments, whose keys have texts of their own (`operators.VALUE_TEXTS`).
 """
 
 import re
