@@ -39,6 +39,7 @@ from . import house
 ROOMS = ("analysis",)
 NUMBERS = {
     "Array",
+    "RowArray",
     "Bools",
     "Ints",
     "Numbers",
@@ -180,7 +181,13 @@ def _is_numbers(path: Path, name: str) -> bool:
     """True for a type of numbers: one of `NUMBERS`, or a class all of whose fields have such
     types.
     """
-    places = [] if name in NUMBERS else _resolve(path, name)
+    if name in NUMBERS:
+        return True
+    alias = _module_names(path).get(name)
+    if isinstance(alias, ast.expr):
+        # a type that has a name of its own, such as the key of a mapping
+        return all(_is_numbers(path, inner) for inner in _names_in(alias) if inner != name)
+    places = _resolve(path, name)
     for place in places:
         node = _definition(place)
         if not _in_rooms(place):
@@ -192,7 +199,7 @@ def _is_numbers(path: Path, name: str) -> bool:
                 _is_numbers(place.module, inner) for inner in _names_in(field.annotation)
             ):
                 return False
-    return name in NUMBERS or bool(places)
+    return bool(places)
 
 
 @cache
